@@ -1,0 +1,1 @@
+"""Pure geometry: rigid transforms, projection, voxel traversal, interpolation."""

@@ -1,0 +1,1 @@
+"""The stages: thin, each reads artifacts, calls one room, writes artifacts."""
