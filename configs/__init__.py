@@ -1,0 +1,1 @@
+"""Presets, as package data: `default.toml`, `demo.toml`, `paper.toml`, ..."""
