@@ -1,6 +1,7 @@
 """Rigid transforms. `T_dst_src` maps src coordinates to dst; quaternions are (w, x, y, z)."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -21,7 +22,7 @@ def transform_points(T_dst_src: np.ndarray, points_src: np.ndarray) -> np.ndarra
     return points_src @ T_dst_src[:3, :3].T + T_dst_src[:3, 3]
 
 
-def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray = (0.0, 0.0, 1.0)) -> np.ndarray:
+def look_at(position: np.ndarray, target: np.ndarray, up: Sequence[float] = (0.0, 0.0, 1.0)) -> np.ndarray:
     """T_world_camera (4, 4) of a camera at `position` that looks at `target`, image y axis away from `up`.
 
     When the viewing direction is parallel to `up`, the world x axis stands in for `up`.

@@ -43,6 +43,8 @@ class Frame:
         check_pose(self.T_world_camera, f"frame {self.step}")
         shape = (self.camera.height, self.camera.width)
         if self.rgb.shape != (*shape, 3) or self.rgb.dtype != np.uint8:
-            raise InputError(f"frame {self.step}: rgb is {self.rgb.shape} {self.rgb.dtype}, expected {(*shape, 3)} uint8")
+            got = f"{self.rgb.shape} {self.rgb.dtype}"
+            raise InputError(f"frame {self.step}: rgb is {got}, expected {(*shape, 3)} uint8")
         if self.depth.shape != shape or self.depth.dtype != np.float32:
-            raise InputError(f"frame {self.step}: depth is {self.depth.shape} {self.depth.dtype}, expected {shape} float32")
+            got = f"{self.depth.shape} {self.depth.dtype}"
+            raise InputError(f"frame {self.step}: depth is {got}, expected {shape} float32")

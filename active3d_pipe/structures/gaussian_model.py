@@ -27,7 +27,8 @@ class GaussianModel:
 
     def __post_init__(self) -> None:
         n = len(self.means)
-        for name, tail in (("means", (3,)), ("log_scales", (3,)), ("quats", (4,)), ("opacity_logits", ()), ("colors", (3,))):
+        tails = {"means": (3,), "log_scales": (3,), "quats": (4,), "opacity_logits": (), "colors": (3,)}
+        for name, tail in tails.items():
             a = getattr(self, name)
             if a.shape != (n, *tail) or a.dtype != np.float32:
                 raise InputError(f"gaussians: {name} is {a.shape} {a.dtype}, expected {(n, *tail)} float32")

@@ -70,7 +70,7 @@ class VoxelGrid:
 
     def contains_index(self, ijk: np.ndarray) -> np.ndarray:
         """(...) bool, whether indices lie inside the grid."""
-        return ((ijk >= 0) & (ijk < np.asarray(self.shape))).all(axis=-1)
+        return np.asarray(((ijk >= 0) & (ijk < np.asarray(self.shape))).all(axis=-1))
 
     def centre_of(self, ijk: np.ndarray) -> np.ndarray:
         """(..., 3) float64 world positions of the centres of voxels `ijk`."""

@@ -1,0 +1,181 @@
+"""One closed, immutable MCAP per round: what the camera saw, from where, and the path it was asked to walk.
+
+Foxglove protobuf schemas, so that Rerun, Foxglove, and any MCAP reader with the embedded descriptors open it.
+Times are simulated, never wall clock: equal runs give equal bytes.
+"""
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from active3d_pipe import __version__
+from active3d_pipe.errors import ArtifactError
+from active3d_pipe.geometry import se3
+from active3d_pipe.storage.files import reading, writing
+from active3d_pipe.structures import Camera, Frame
+
+COLOR, DEPTH, CALIBRATION = "/camera/color/image", "/camera/depth/image", "/camera/color/calibration"
+DEPTH_CALIBRATION, TRANSFORMS, POSE, PATH = "/camera/depth/calibration", "/tf", "/camera/pose", "/plan/path"
+WORLD, OPTICAL = "world", "camera_optical"
+STEP_NS = 100_000_000  # simulated duration of a step
+
+
+def write_frames(path: Path, frames: Sequence[Frame], planned_path: np.ndarray) -> None:
+    """Write frames and the planned path (M, 4, 4) T_world_camera to a closed MCAP file."""
+    from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+    from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+    from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+    from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+    from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+    from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+    from mcap.writer import CompressionType, Writer
+    from mcap_protobuf.schema import register_schema
+
+    topics = {
+        COLOR: CompressedImage, DEPTH: RawImage, CALIBRATION: CameraCalibration, DEPTH_CALIBRATION: CameraCalibration,
+        TRANSFORMS: FrameTransforms, POSE: PoseInFrame, PATH: PosesInFrame,
+    }
+    with writing(path), path.open("wb") as stream:
+        writer = Writer(stream, compression=CompressionType.ZSTD, enable_crcs=True)
+        # Set by ourselves: the default names the library's version, and an upgrade would change the bytes.
+        writer.start(profile="", library=f"active3d/{__version__}")
+        schemas = {cls: register_schema(writer, cls) for cls in dict.fromkeys(topics.values())}
+        channels = {topic: writer.register_channel(topic, "protobuf", schemas[cls]) for topic, cls in topics.items()}
+
+        def add(topic: str, message: Any, frame: Frame) -> None:
+            data = message.SerializeToString(deterministic=True)
+            writer.add_message(channels[topic], frame.stamp_ns, data, frame.stamp_ns, sequence=frame.step)
+
+        for i, frame in enumerate(frames):
+            if i == 0:
+                add(PATH, _path_message(PosesInFrame(), frame, planned_path), frame)
+            add(COLOR, _color_message(CompressedImage(), frame), frame)
+            add(DEPTH, _depth_message(RawImage(), frame), frame)
+            add(CALIBRATION, _calibration_message(CameraCalibration(), frame), frame)
+            add(DEPTH_CALIBRATION, _calibration_message(CameraCalibration(), frame), frame)
+            add(TRANSFORMS, _transform_message(FrameTransforms(), frame), frame)
+            add(POSE, _pose_message(PoseInFrame(), frame), frame)
+        writer.add_metadata("active3d", {"schema": "active3d.capture/1", "camera": _range_text(frames)})
+        writer.finish()
+
+
+def read_frames(path: Path) -> list[Frame]:
+    """Read the frames of a closed log, checksums verified; ArtifactError when it is damaged."""
+    from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+    from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+    from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+    from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+    from mcap.reader import SeekingReader
+
+    types = {COLOR: CompressedImage, DEPTH: RawImage, CALIBRATION: CameraCalibration, POSE: PoseInFrame}
+    messages: dict[int, dict[str, Any]] = {}
+    stamps: dict[int, int] = {}
+    with reading(path, "a closed MCAP log of active3d"), path.open("rb") as stream:
+        reader = SeekingReader(stream, validate_crcs=True, record_size_limit=256 * 2**20)
+        for _, channel, record in reader.iter_messages(topics=list(types)):
+            message = types[channel.topic]()
+            message.ParseFromString(record.data)
+            messages.setdefault(record.sequence, {})[channel.topic] = message
+            stamps[record.sequence] = record.log_time
+        ranges = next((dict(m.metadata) for m in reader.iter_metadata() if m.name == "active3d"), {})
+        near, far = (float(x) for x in ranges.get("camera", "0.05 10").split())
+        frames = []
+        for step in sorted(messages):
+            found = messages[step]
+            if set(found) != set(types):
+                raise ArtifactError(f"{path}: step {step} has {sorted(found)}, expected {sorted(types)}")
+            frames.append(_frame(step, stamps[step], found, near, far))
+        return frames
+
+
+def _frame(step: int, stamp_ns: int, found: dict, near: float, far: float) -> Frame:
+    calibration, depth_message = found[CALIBRATION], found[DEPTH]
+    K = calibration.K
+    camera = Camera(calibration.width, calibration.height, K[0], K[4], K[2], K[5], near, far)
+    rgb = np.asarray(Image.open(io.BytesIO(found[COLOR].data)).convert("RGB"))
+    depth = np.frombuffer(depth_message.data, "<f4").reshape(camera.height, camera.width).astype(np.float32)
+    pose = found[POSE].pose
+    T = np.eye(4)
+    q = pose.orientation
+    T[:3, :3] = se3.matrix_from_quat(np.array([q.w, q.x, q.y, q.z]))
+    T[:3, 3] = pose.position.x, pose.position.y, pose.position.z
+    return Frame(step, stamp_ns, camera, T, rgb, depth)
+
+
+def _range_text(frames: Sequence[Frame]) -> str:
+    camera = frames[0].camera if frames else Camera(1, 1, 1, 1, 0.5, 0.5)
+    return f"{camera.near!r} {camera.far!r}"
+
+
+def _stamp(message: Any, frame: Frame, frame_id: str) -> None:
+    message.timestamp.FromNanoseconds(frame.stamp_ns)
+    message.timestamp.SetInParent()
+    message.frame_id = frame_id
+
+
+def _set_pose(pose: Any, T: np.ndarray) -> None:
+    # Sub-messages are set explicitly: an unset one makes strict readers fail even when every value is zero.
+    pose.SetInParent()
+    position, orientation = pose.position, pose.orientation
+    position.SetInParent()
+    orientation.SetInParent()
+    position.x, position.y, position.z = (float(v) for v in T[:3, 3])
+    q = se3.quat_from_matrix(T[:3, :3])
+    orientation.w, orientation.x, orientation.y, orientation.z = (float(v) for v in q)
+
+
+def _color_message(message: Any, frame: Frame) -> Any:
+    _stamp(message, frame, OPTICAL)
+    buffer = io.BytesIO()
+    Image.fromarray(frame.rgb).save(buffer, "PNG", compress_level=1)
+    message.data, message.format = buffer.getvalue(), "png"
+    return message
+
+
+def _depth_message(message: Any, frame: Frame) -> Any:
+    _stamp(message, frame, OPTICAL)
+    message.width, message.height = frame.camera.width, frame.camera.height
+    message.encoding, message.step = "32FC1", 4 * frame.camera.width
+    message.data = np.ascontiguousarray(frame.depth, "<f4").tobytes()
+    return message
+
+
+def _calibration_message(message: Any, frame: Frame) -> Any:
+    _stamp(message, frame, OPTICAL)
+    c = frame.camera
+    message.width, message.height = c.width, c.height
+    message.K.extend([c.fx, 0, c.cx, 0, c.fy, c.cy, 0, 0, 1])
+    message.R.extend([1, 0, 0, 0, 1, 0, 0, 0, 1])
+    message.P.extend([c.fx, 0, c.cx, 0, 0, c.fy, c.cy, 0, 0, 0, 1, 0])
+    return message
+
+
+def _transform_message(message: Any, frame: Frame) -> Any:
+    transform = message.transforms.add()
+    transform.timestamp.FromNanoseconds(frame.stamp_ns)
+    transform.timestamp.SetInParent()
+    transform.parent_frame_id, transform.child_frame_id = WORLD, OPTICAL
+    transform.translation.SetInParent()
+    transform.rotation.SetInParent()
+    T = frame.T_world_camera
+    transform.translation.x, transform.translation.y, transform.translation.z = (float(v) for v in T[:3, 3])
+    q = se3.quat_from_matrix(T[:3, :3])
+    transform.rotation.w, transform.rotation.x, transform.rotation.y, transform.rotation.z = (float(v) for v in q)
+    return message
+
+
+def _pose_message(message: Any, frame: Frame) -> Any:
+    _stamp(message, frame, WORLD)
+    _set_pose(message.pose, frame.T_world_camera)
+    return message
+
+
+def _path_message(message: Any, frame: Frame, planned_path: np.ndarray) -> Any:
+    _stamp(message, frame, WORLD)
+    for T in planned_path:
+        _set_pose(message.poses.add(), T)
+    return message
