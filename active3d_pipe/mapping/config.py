@@ -1,0 +1,49 @@
+"""Knobs of the mapping room."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from active3d_pipe.field.config import FieldSettings
+from active3d_pipe.gaussians.config import GaussianSettings
+from active3d_pipe.structures import Settings
+
+
+class KeyframeSettings(Settings):
+    """Which frames become keyframes (eq. kf_selection)."""
+
+    policy: Literal["uncertainty", "every_n"] = Field("uncertainty", description="the paper's rule, or every n-th frame")
+    every_n: int = Field(5, ge=1, description="policy every_n: distance between keyframes, steps")
+    tau_view: float = Field(0.18, ge=0, le=1, description="least viewpoint divergence delta_c from every keyframe")
+    tau_info: float = Field(25.0, ge=0, description="least hybrid information gain of a frame, bits")
+    tau_rho: float = Field(0.005, ge=0, le=1, description="least share of visible voxels that lie in V_high")
+    tau_high: float = Field(0.15, ge=0, description="uncertainty above which a voxel belongs to V_high, both branches")
+    max_gap: int = Field(8, ge=1, description="a frame that diverges enough is promoted after this many steps anyway")
+
+
+class WindowSettings(Settings):
+    """Which keyframes are optimised together (eq. sw_energy)."""
+
+    policy: Literal["viewpoint", "temporal"] = Field("viewpoint", description="neighbours in viewpoint space, or in time")
+    size: int = Field(10, ge=1, description="keyframes in the window, m")
+    replay: float = Field(0.3, ge=0, le=1, description="share of iterations on random older keyframes (E_reg)")
+
+
+class MappingSettings(Settings):
+    """The hybrid map and its optimisation."""
+
+    representation: Literal["hybrid", "implicit_only", "explicit_only"] = Field(
+        "hybrid", description="hybrid: branches coupled; the others are the variants of the paper's table `converge`"
+    )
+    gaussian_iterations_per_step: float = Field(4.0, ge=0, description="rasteriser iterations for every captured frame")
+    field_iterations_per_step: float = Field(1.0, ge=0, description="field iterations for every captured frame")
+    first_round_factor: float = Field(1.5, gt=0, description="iterations of round 0 are multiplied by this")
+    coupling_every: int = Field(10, ge=1, description="E_geo is applied on every n-th Gaussian iteration")
+    add_per_round: int = Field(6000, ge=0, description="most primitives that error-driven adding inserts in a round")
+    learning_rate_scale: float = Field(0.4, gt=0, description="scale on the Gaussians' learning rates while exploring")
+    refinement_iterations: int = Field(1500, ge=0, description="annealed iterations over all logged frames, in export")
+    refinement_field_iterations: int = Field(300, ge=0, description="annealed field iterations, in export")
+    field: FieldSettings = Field(default_factory=FieldSettings, description="implicit branch")
+    gaussians: GaussianSettings = Field(default_factory=GaussianSettings, description="explicit branch")
+    keyframes: KeyframeSettings = Field(default_factory=KeyframeSettings, description="keyframe selection")
+    window: WindowSettings = Field(default_factory=WindowSettings, description="viewpoint-space sliding window")

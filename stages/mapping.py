@@ -1,0 +1,36 @@
+"""Mapping: fold the new frames into the hybrid map."""
+
+from active3d_pipe.pipeline.stage import NodeId, Stage, StageContext
+from stages import shared
+
+
+def _inputs(round: int) -> tuple[NodeId, ...]:
+    before = () if round == 0 else (NodeId("mapping", round - 1), NodeId("uncertainty", round - 1))
+    return (*shared.captures(round), *before)
+
+
+def _run(context: StageContext) -> None:
+    import numpy as np
+    from active3d_pipe.mapping.hybrid_map import HybridMap
+    from active3d_pipe.mapping.update import update_map
+
+    from active3d_pipe.storage import volumes
+    from active3d_pipe.storage.files import write_json
+
+    config, k = context.config, context.round
+    frames = shared.load_frames(context.input("capture", k))
+    if k == 0:
+        bounds = np.array(shared.load_rig(context.inputs)["bounds"])
+        hybrid = HybridMap.create(bounds[0], bounds[1], config.mapping, context.rng("initial parameters"))
+        volume = None
+    else:
+        hybrid = shared.load_map(context.input("mapping", k - 1), context.inputs, config)
+        volume = volumes.read_volume(context.input("uncertainty", k - 1) / shared.VOLUME_NAME)
+    report = update_map(hybrid, frames, volume, k, config.mapping, context.rng("updates"), context.progress)
+    shared.save_map(context.out, hybrid)
+    write_json(context.out / "mapping.json", {"schema": "active3d.mapping/1", "round": k, **report.numbers})
+    context.timings.update(report.seconds)
+    context.notes.update(report.numbers)
+
+
+STAGE = Stage(name="mapping", version=1, config=("mapping",), inputs=_inputs, run=_run, loop=True)

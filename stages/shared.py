@@ -1,0 +1,106 @@
+"""What several stages need: cached frames, cached simulator, the map on disk."""
+
+from collections import OrderedDict
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from active3d_pipe.pipeline.stage import NodeId
+
+if TYPE_CHECKING:
+    from active3d_pipe.mapping.hybrid_map import HybridMap
+    from active3d_pipe.sim.simulator import Simulator
+
+    from active3d_pipe.structures import Frame
+
+LOG_NAME, CAPTURE_NAME, VOLUME_NAME, DECISION_NAME = "frames.mcap", "capture.json", "volume.zarr", "decision.json"
+CACHE_BYTES = 1 << 30  # decoded frames kept in memory between the stages of one process
+
+_frames: "OrderedDict[tuple, list[Frame]]" = OrderedDict()
+_simulators: "dict[str, Simulator]" = {}
+
+
+def captures(last_round: int) -> tuple[NodeId, ...]:
+    """The capture nodes of rounds 0..last_round."""
+    return tuple(NodeId("capture", k) for k in range(last_round + 1))
+
+
+def load_frames(folder: Path) -> "list[Frame]":
+    """Frames of one capture artifact; decoded once a process while the cache has room."""
+    from active3d_pipe.storage import capture_log
+
+    path = folder / LOG_NAME
+    stat = path.stat() if path.exists() else None
+    key = (str(path), stat.st_ino, stat.st_mtime_ns, stat.st_size) if stat else (str(path),)
+    if key in _frames:
+        _frames.move_to_end(key)
+        return _frames[key]
+    frames = capture_log.read_frames(path)
+    _frames[key] = frames
+    while len(_frames) > 1 and sum(f.rgb.nbytes + f.depth.nbytes for fs in _frames.values() for f in fs) > CACHE_BYTES:
+        _frames.popitem(last=False)
+    return frames
+
+
+def load_rig(inputs: Mapping[NodeId, Path]) -> dict[str, Any]:
+    """What the first capture says of the scene box and the start pose: all that later stages may know of the world."""
+    from active3d_pipe.storage.files import read_json
+
+    return read_json(inputs[NodeId("capture", 0)] / CAPTURE_NAME)["rig"]
+
+
+def volume_grid(rig: dict[str, Any], voxel_size: float) -> Any:
+    """The voxel grid over the box to explore."""
+    from active3d_pipe.structures import VoxelGrid
+
+    return VoxelGrid.from_bounds(np.array(rig["bounds"][0]), np.array(rig["bounds"][1]), voxel_size)
+
+
+def make_simulator(config: Any, seed: int) -> "Simulator":
+    """The simulator of this configuration, made once a process."""
+    from active3d_pipe.sim.simulator import make_simulator as make
+
+    key = "|".join(s.model_dump_json() for s in (config.scene, config.camera, config.sensor)) + f"|{seed}"
+    if key not in _simulators:
+        _simulators.clear()
+        _simulators[key] = make(config.scene, config.camera, config.sensor, seed)
+    return _simulators[key]
+
+
+def walked_poses(inputs: Mapping[NodeId, Path], last_round: int) -> np.ndarray:
+    """(M, 4, 4) poses of every captured frame, in order."""
+    from active3d_pipe.storage.files import read_json
+
+    folders = [inputs[node] for node in captures(last_round)]
+    return np.concatenate([np.array(read_json(folder / CAPTURE_NAME)["poses"]) for folder in folders])
+
+
+def save_map(folder: Path, hybrid: "HybridMap") -> None:
+    """Write a map: parameters, optimiser state, keyframe list."""
+    from active3d_pipe.storage.files import write_json, write_tensors
+
+    state = hybrid.state()
+    write_tensors(folder / "field.safetensors", state["field"])
+    write_tensors(folder / "gaussians.safetensors", state["gaussians"])
+    write_tensors(folder / "optimiser.safetensors", state["optimiser"])
+    write_json(folder / "keyframes.json", [k.to_json() for k in hybrid.keyframes])
+
+
+def load_map(folder: Path, inputs: Mapping[NodeId, Path], config: Any) -> "HybridMap":
+    """Read a map; its keyframes' images come from the capture logs among `inputs`."""
+    from active3d_pipe.mapping.hybrid_map import HybridMap
+
+    from active3d_pipe.mapping.keyframes import Keyframe
+    from active3d_pipe.storage.files import read_json, read_tensors
+
+    keyframes = []
+    for doc in read_json(folder / "keyframes.json"):
+        frames = load_frames(inputs[NodeId("capture", doc["round"])])
+        frame = frames[doc["step"] - frames[0].step]
+        keyframes.append(Keyframe(frame, doc["round"], doc["reason"], doc["delta"], doc["gain"], doc["rho"]))
+    names = ("field", "gaussians", "optimiser")
+    state = {name: read_tensors(folder / f"{name}.safetensors")[0] for name in names}
+    bounds = np.array(load_rig(inputs)["bounds"])
+    return HybridMap.from_state(bounds[0], bounds[1], config.mapping, state, keyframes)
