@@ -1,0 +1,62 @@
+"""Knobs of the implicit branch."""
+
+from pydantic import Field, field_validator
+
+from active3d_pipe.structures import Settings
+
+
+class FieldSettings(Settings):
+    """Encodings, decoders, ray sampling, losses and optimiser of the neural SDF field."""
+
+    plane_resolutions_m: tuple[float, ...] = Field(
+        (0.24, 0.06), min_length=1, description="node spacing of each tri-plane level of the geometry features, m"
+    )
+    color_plane_resolutions_m: tuple[float, ...] = Field(
+        (0.24, 0.06), min_length=1, description="node spacing of each tri-plane level of the colour features, m"
+    )
+    plane_channels: int = Field(16, gt=0, multiple_of=8, description="features of a plane node")
+    grid_voxel_m: float = Field(0.1, gt=0, description="node spacing of the dense feature grid, m")
+    grid_channels: int = Field(4, gt=0, multiple_of=4, description="features of a grid node")
+    oneblob_bins: int = Field(16, ge=2, description="bins per axis of the OneBlob encoding")
+    hidden: int = Field(32, gt=0, multiple_of=8, description="width of the hidden layer of every decoder")
+    geometry_features: int = Field(15, gt=0, description="features that the geometry decoder hands to the colour one")
+    max_table_megabytes: float = Field(
+        512.0, gt=0, description="refuse bounds and resolutions whose feature tables need more memory, MB"
+    )
+
+    truncation_m: float = Field(0.1, gt=0, description="distance at which the SDF is truncated, m")
+    bell_width_m: float = Field(
+        0.01, gt=0, description="width of the bell that turns SDF values into rendering weights, m of SDF"
+    )
+    sigma_prior_m: float = Field(0.3, gt=0, description="standard deviation of the SDF where nothing was seen, m")
+    sigma_floor_m: float = Field(0.002, gt=0, description="smallest standard deviation of the SDF, m")
+
+    rays: int = Field(1024, gt=0, description="rays per iteration")
+    free_samples: int = Field(6, ge=0, description="stratified samples a ray between camera and truncation band")
+    surface_samples: int = Field(9, gt=1, description="stratified samples a ray within the truncation band")
+    behind_fraction: float = Field(
+        1.0, gt=0, le=1, description="part of the truncation band behind the surface that is sampled"
+    )
+    prior_points: int = Field(512, ge=0, description="random points per iteration that hold unseen space at its prior")
+
+    rate_tables: float = Field(0.01, gt=0, description="Adam learning rate of planes and grid")
+    rate_decoders: float = Field(0.01, gt=0, description="Adam learning rate of the decoders")
+    beta1: float = Field(0.9, ge=0, lt=1, description="Adam decay of the first moment")
+    beta2: float = Field(0.99, ge=0, lt=1, description="Adam decay of the second moment")
+    adam_eps: float = Field(1e-15, gt=0, description="Adam denominator offset")
+
+    weight_rgb: float = Field(5.0, ge=0, description="weight of the colour loss")
+    weight_depth: float = Field(0.1, ge=0, description="weight of the rendered depth loss, 1/m2")
+    weight_sdf: float = Field(1000.0, ge=0, description="weight of the SDF loss in the truncation band, 1/m2")
+    weight_free: float = Field(10.0, ge=0, description="weight of the free-space loss, in truncation units")
+    weight_uncertainty: float = Field(0.005, ge=0, description="weight of the uncertainty losses")
+    weight_prior: float = Field(0.005, ge=0, description="weight of the uncertainty prior in unseen space")
+    weight_smoothness: float = Field(0.001, ge=0, description="weight of the smoothness loss, in truncation units")
+    smoothness_step_m: float = Field(0.05, gt=0, description="distance of the point pairs of the smoothness loss, m")
+
+    @field_validator("plane_resolutions_m", "color_plane_resolutions_m")
+    @classmethod
+    def _positive(cls, value: tuple[float, ...]) -> tuple[float, ...]:
+        if min(value) <= 0:
+            raise ValueError("every plane resolution must be positive")
+        return value

@@ -1,0 +1,105 @@
+"""Feature tables over a box, and their differentiable interpolation."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from active3d_pipe.errors import ConfigError
+from active3d_pipe.field import kernels
+
+PLANE_AXES = ((0, 1), (0, 2), (1, 2))
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneLayout:
+    """Where the planes of all levels lie in one table.
+
+    Attributes:
+        rows: (P, 6) int64, a row a plane: first node, nodes along a, nodes along b, a, b, level.
+        inv_resolution: (P,) float32, 1/m.
+        nodes: number of nodes of the table.
+        levels: number of levels.
+    """
+
+    rows: np.ndarray
+    inv_resolution: np.ndarray
+    nodes: int
+    levels: int
+
+    @classmethod
+    def of_box(cls, extent: np.ndarray, resolutions_m: tuple[float, ...]) -> "PlaneLayout":
+        """Three axis-aligned planes a level over a box of `extent` (3,) m."""
+        rows, inv, nodes = [], [], 0
+        for level, resolution in enumerate(resolutions_m):
+            n = node_counts(extent, resolution)
+            for a, b in PLANE_AXES:
+                rows.append((nodes, n[a], n[b], a, b, level))
+                inv.append(1 / resolution)
+                nodes += int(n[a] * n[b])
+        return cls(np.array(rows, dtype=np.int64), np.array(inv, dtype=np.float32), nodes, len(resolutions_m))
+
+
+def node_counts(extent: np.ndarray, resolution_m: float) -> np.ndarray:
+    """(3,) number of nodes, spaced by `resolution_m`, that cover a box of `extent` m."""
+    return np.maximum(np.ceil(np.asarray(extent) / resolution_m - 1e-6).astype(np.int64) + 1, 2)
+
+
+def check_memory(values: int, limit_megabytes: float) -> None:
+    """Raise ConfigError when tables of `values` floats exceed the limit."""
+    megabytes = values * 4 / 1e6
+    if megabytes > limit_megabytes:
+        raise ConfigError(
+            f"field: feature tables need {megabytes:.0f} MB, more than field.max_table_megabytes={limit_megabytes:g}; "
+            "coarser field.grid_voxel_m or field.plane_resolutions_m, or smaller bounds, need less"
+        )
+
+
+class EncodePlanes(torch.autograd.Function):
+    """Tri-plane features (N, levels * channels) of points (N, 3); gradient to the table only."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, table: torch.Tensor, points: np.ndarray, low: np.ndarray, layout: PlaneLayout
+    ) -> torch.Tensor:
+        """`table` (nodes, channels) float32, `points` (N, 3) float32 world m, `low` (3,) float32."""
+        ctx.points, ctx.low, ctx.layout, ctx.shape = points, low, layout, table.shape
+        out = torch.empty((len(points), layout.levels * table.shape[1]))
+        kernels.planes_forward(
+            points, low, table.detach().numpy(), layout.rows, layout.inv_resolution, out.numpy(), 0
+        )
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *d_out: torch.Tensor) -> tuple[torch.Tensor, None, None, None]:
+        """Gradient of the table."""
+        d_table = torch.zeros(ctx.shape)
+        kernels.planes_backward(
+            ctx.points, ctx.low, ctx.layout.rows, ctx.layout.inv_resolution,
+            d_out[0].contiguous().numpy(), 0, d_table.numpy(),
+        )
+        return d_table, None, None, None
+
+
+class EncodeGrid(torch.autograd.Function):
+    """Trilinear features (N, channels) of points (N, 3); gradient to the grid only."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, grid: torch.Tensor, points: np.ndarray, low: np.ndarray, inv_resolution: np.float32
+    ) -> torch.Tensor:
+        """`grid` (X, Y, Z, channels) float32, `points` (N, 3) float32 world m, `low` (3,) float32."""
+        ctx.points, ctx.low, ctx.inv_resolution, ctx.shape = points, low, inv_resolution, grid.shape
+        out = torch.empty((len(points), grid.shape[3]))
+        kernels.grid_forward(points, low, grid.detach().numpy(), inv_resolution, out.numpy(), 0)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *d_out: torch.Tensor) -> tuple[torch.Tensor, None, None, None]:
+        """Gradient of the grid."""
+        d_grid = torch.zeros(ctx.shape)
+        kernels.grid_backward(
+            ctx.points, ctx.low, ctx.inv_resolution, d_out[0].contiguous().numpy(), 0, d_grid.numpy()
+        )
+        return d_grid, None, None, None

@@ -1,0 +1,248 @@
+"""The implicit branch F_theta: a neural signed distance field with colour and uncertainty (paper, eq. sdf_mlp)."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from active3d_pipe.errors import ArtifactError, ConfigError
+from active3d_pipe.field import kernels
+from active3d_pipe.field.config import FieldSettings
+from active3d_pipe.field.encoding import EncodeGrid, EncodePlanes, PlaneLayout, check_memory, node_counts
+from active3d_pipe.structures import VoxelGrid
+
+
+class FieldSamples(NamedTuple):
+    """Values of the field at N points: sdf (N,) m, sigma (N,) m, color (N, 3) in 0..1; all float32."""
+
+    sdf: np.ndarray
+    sigma: np.ndarray
+    color: np.ndarray
+
+
+class Geometry(NamedTuple):
+    """What the geometry decoder and the uncertainty head give at N points, in truncation units.
+
+    sdf (N,), sigma (N,), features (N, G) for the colour decoder, oneblob (N, 3 * bins).
+    """
+
+    sdf: torch.Tensor
+    sigma: torch.Tensor
+    features: torch.Tensor
+    oneblob: torch.Tensor
+
+
+class SdfField(torch.nn.Module):
+    """SDF, its standard deviation and colour over a box.
+
+    OneBlob(x), tri-plane features gamma(x) and dense grid features V_alpha(x) feed the geometry decoder; the
+    uncertainty head (eq. global_uncertainty) sees gamma(x) and V_alpha(x) only, so that what it learned at one
+    place reaches another only through features. Both are one matrix product. The SDF starts at +truncation
+    (free) and sigma at its prior; `visits` counts the training samples that fell into every grid cell, and
+    cells without any are where the prior is held (`losses.prior_loss`).
+
+    Args:
+        low, high: (3,) corners of the box in the world, m. Points outside take the values of its border.
+        settings: see `FieldSettings`.
+        generator: draws the initial weights.
+    """
+
+    def __init__(
+        self, low: np.ndarray, high: np.ndarray, settings: FieldSettings, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.low = np.asarray(low, dtype=np.float32)
+        self.high = np.asarray(high, dtype=np.float32)
+        self.settings = settings
+        if self.low.shape != (3,) or not (self.high > self.low).all():
+            raise ConfigError(f"field bounds {self.low.tolist()} .. {self.high.tolist()}: expected low < high")
+        extent = self.high - self.low
+        self._inv_extent = (1 / extent).astype(np.float32)
+        self._layout = PlaneLayout.of_box(extent, settings.plane_resolutions_m)
+        self._color_layout = PlaneLayout.of_box(extent, settings.color_plane_resolutions_m)
+        self._inv_grid = np.float32(1 / settings.grid_voxel_m)
+        nodes = node_counts(extent, settings.grid_voxel_m)
+        c, g = settings.plane_channels, settings.grid_channels
+        check_memory(
+            (self._layout.nodes + self._color_layout.nodes) * c + int(nodes.prod()) * g, settings.max_table_megabytes
+        )
+        self.visits = np.zeros(tuple(nodes - 1), dtype=np.uint32)
+
+        def normal(*shape: int, std: float) -> torch.nn.Parameter:
+            return torch.nn.Parameter(torch.randn(*shape, generator=generator) * std)
+
+        def zeros(*shape: int, value: float = 0.0) -> torch.nn.Parameter:
+            return torch.nn.Parameter(torch.full(shape, value))
+
+        bins, hidden = 3 * settings.oneblob_bins, settings.hidden
+        width = self._layout.levels * c + g
+        self.planes = normal(self._layout.nodes, c, std=0.01)
+        self.color_planes = normal(self._color_layout.nodes, c, std=0.01)
+        self.grid = zeros(*(int(n) for n in nodes), g)
+        # First layers of the geometry decoder (columns [:hidden]) and the uncertainty head ([hidden:]).
+        self.blob_weight = normal(bins, hidden, std=math.sqrt(2 / 3))
+        self.feature_weight = normal(width, 2 * hidden, std=math.sqrt(2 / width))
+        self.bias = zeros(2 * hidden)
+        self.geometry_weight = normal(hidden, 1 + settings.geometry_features, std=0.1 / math.sqrt(hidden))
+        self.geometry_bias = torch.nn.Parameter(
+            torch.cat([torch.ones(1), torch.zeros(settings.geometry_features)])
+        )
+        self.sigma_weight = normal(hidden, 1, std=0.1 / math.sqrt(hidden))
+        sigma_prior = max(settings.sigma_prior_m - settings.sigma_floor_m, 1e-4) / settings.truncation_m
+        self.sigma_bias = zeros(1, value=sigma_prior + math.log(-math.expm1(-sigma_prior)))
+        color_width = settings.geometry_features + self._color_layout.levels * c
+        self.color_blob_weight = normal(bins, hidden, std=math.sqrt(2 / 3))
+        self.color_feature_weight = normal(color_width, hidden, std=math.sqrt(2 / color_width))
+        self.color_hidden_bias = zeros(hidden)
+        self.color_weight = normal(hidden, 3, std=0.1 / math.sqrt(hidden))
+        self.color_bias = zeros(3)
+
+    @property
+    def truncation_m(self) -> float:
+        """Distance at which the SDF is truncated, m."""
+        return self.settings.truncation_m
+
+    @property
+    def visit_grid(self) -> VoxelGrid:
+        """The cells that `visits` counts on."""
+        return VoxelGrid(self.low, self.settings.grid_voxel_m, self.visits.shape)
+
+    def oneblob(self, points: np.ndarray) -> torch.Tensor:
+        """(N, 3 * bins) OneBlob encoding of world points (N, 3) float32."""
+        out = torch.empty((len(points), 3 * self.settings.oneblob_bins))
+        kernels.oneblob(points, self.low, self._inv_extent, self.settings.oneblob_bins, out.numpy())
+        return out
+
+    def geometry(self, points: np.ndarray) -> Geometry:
+        """Differentiable geometry and uncertainty at world points (N, 3) float32, truncation units."""
+        hidden, floor = self.settings.hidden, self.settings.sigma_floor_m / self.truncation_m
+        blob = self.oneblob(points)
+        features = torch.cat([
+            EncodePlanes.apply(self.planes, points, self.low, self._layout),
+            EncodeGrid.apply(self.grid, points, self.low, self._inv_grid),
+        ], dim=1)
+        h = torch.addmm(self.bias, features, self.feature_weight)
+        h_geometry = torch.relu(torch.addmm(h[:, :hidden], blob, self.blob_weight))
+        h_sigma = torch.relu(h[:, hidden:])
+        decoded = torch.addmm(self.geometry_bias, h_geometry, self.geometry_weight)
+        raw_sigma = torch.addmm(self.sigma_bias, h_sigma, self.sigma_weight)[:, 0]
+        sigma = torch.nn.functional.softplus(raw_sigma) + floor
+        return Geometry(decoded[:, 0], sigma, decoded[:, 1:], blob)
+
+    def color(self, points: np.ndarray, oneblob: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
+        """Differentiable colour (N, 3) in 0..1 of points (N, 3), given their OneBlob and geometry features."""
+        planes = EncodePlanes.apply(self.color_planes, points, self.low, self._color_layout)
+        h = torch.addmm(self.color_hidden_bias, oneblob, self.color_blob_weight)
+        h = torch.addmm(h, torch.cat([features, planes], dim=1), self.color_feature_weight)
+        return torch.sigmoid(torch.addmm(self.color_bias, torch.relu(h), self.color_weight))
+
+    def _decode(self, points: np.ndarray, with_sigma: bool) -> np.ndarray:
+        """(N, 1 or 2) raw SDF and sigma before its softplus, by the fused kernel."""
+        hidden = self.settings.hidden
+        points = _as_points(points)
+        blob, feature, bias, w_geometry, w_sigma, b_geometry, b_sigma = (
+            p.detach().numpy() for p in (
+                self.blob_weight, self.feature_weight, self.bias, self.geometry_weight, self.sigma_weight,
+                self.geometry_bias, self.sigma_bias,
+            )
+        )
+        columns = 2 * hidden if with_sigma else hidden
+        w1 = np.zeros((len(blob) + len(feature), columns), np.float32)
+        w1[: len(blob), :hidden] = blob
+        w1[len(blob) :] = feature[:, :columns]
+        w2 = np.zeros((2 if with_sigma else 1, columns), np.float32)
+        w2[0, :hidden] = w_geometry[:, 0]
+        b2 = np.zeros(len(w2), np.float32)
+        b2[0] = b_geometry[0]
+        if with_sigma:
+            w2[1, hidden:], b2[1] = w_sigma[:, 0], b_sigma[0]
+        out = np.empty((len(points), len(w2)), np.float32)
+        kernels.decode_points(
+            points, self.low, self._inv_extent, self.settings.oneblob_bins, self.planes.detach().numpy(),
+            self._layout.rows, self._layout.inv_resolution, self.grid.detach().numpy(), self._inv_grid,
+            w1, np.ascontiguousarray(bias[:columns]), w2, b2, out,
+        )
+        return out
+
+    def query_sdf(self, points: np.ndarray) -> np.ndarray:
+        """(N,) float32 SDF in m at world points (N, 3), cut at +-truncation. About 2.5 M points a second."""
+        sdf = self._decode(points, with_sigma=False)[:, 0]
+        return np.clip(sdf, -1, 1) * np.float32(self.truncation_m)
+
+    def query_geometry(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(sdf, sigma), both (N,) float32 m, at world points (N, 3)."""
+        raw = self._decode(points, with_sigma=True)
+        sigma = np.logaddexp(0, raw[:, 1]) * np.float32(self.truncation_m) + np.float32(self.settings.sigma_floor_m)
+        return np.clip(raw[:, 0], -1, 1) * np.float32(self.truncation_m), sigma.astype(np.float32)
+
+    def query(self, points: np.ndarray, batch: int = 65536) -> FieldSamples:
+        """SDF (m), sigma (m) and colour at world points (N, 3), without gradients, `batch` points at a time."""
+        points = _as_points(points)
+        sdf, sigma = self.query_geometry(points)
+        return FieldSamples(sdf, sigma, self.query_color(points, batch))
+
+    def query_color(self, points: np.ndarray, batch: int = 65536) -> np.ndarray:
+        """(N, 3) float32 colour in 0..1 at world points (N, 3)."""
+        points = _as_points(points)
+        color = np.empty((len(points), 3), np.float32)
+        with torch.no_grad():
+            for i in range(0, len(points), batch):
+                part = points[i : i + batch]
+                g = self.geometry(part)
+                color[i : i + batch] = self.color(part, g.oneblob, g.features).numpy()
+        return color
+
+    def normals(self, points: np.ndarray, step_m: float = 0.01) -> np.ndarray:
+        """(N, 3) float32 unit SDF gradients at world points (N, 3), pointing into free space.
+
+        Differences over a tetrahedron of edge vectors (+-1, +-1, +-1) * step_m; zero where the field is flat.
+        """
+        points = _as_points(points)
+        corners = np.array([[1, -1, -1], [-1, -1, 1], [-1, 1, -1], [1, 1, 1]], np.float32)
+        at = points[None] + np.float32(step_m) * corners[:, None]
+        sdf = self._decode(at.reshape(-1, 3), with_sigma=False)[:, 0].reshape(4, -1)
+        gradient = np.einsum("kn,kc->nc", sdf, corners)
+        norm = np.linalg.norm(gradient, axis=1, keepdims=True)
+        return np.divide(gradient, norm, out=np.zeros_like(gradient), where=norm > 1e-8)
+
+    def count_visits(self, points: np.ndarray) -> None:
+        """Count training samples (N, 3) in the cells of `visit_grid`; counts saturate."""
+        shape = np.asarray(self.visits.shape)
+        ijk = np.clip(((points - self.low) * self._inv_grid).astype(np.int64), 0, shape - 1)
+        inside = ((points >= self.low) & (points <= self.high)).all(axis=1)
+        flat = np.ravel_multi_index(tuple(ijk[inside].T), self.visits.shape)
+        cells, counts = np.unique(flat, return_counts=True)
+        visits = self.visits.reshape(-1)
+        visits[cells] = np.minimum(visits[cells].astype(np.int64) + counts, 2**31)
+
+    def visited(self, points: np.ndarray) -> np.ndarray:
+        """(N,) bool, whether training samples fell into the cell of each world point (N, 3)."""
+        shape = np.asarray(self.visits.shape)
+        ijk = np.clip(((points - self.low) * self._inv_grid).astype(np.int64), 0, shape - 1)
+        return self.visits[ijk[:, 0], ijk[:, 1], ijk[:, 2]] > 0
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Every parameter and counter as an array (copies); `load_state` restores them exactly."""
+        arrays = {name: p.detach().numpy().copy() for name, p in self.named_parameters()}
+        return {**arrays, "visits": self.visits.copy()}
+
+    def load_state(self, arrays: dict[str, np.ndarray]) -> None:
+        """Inverse of `state`; ArtifactError when an array is missing or has another form."""
+        expected = self.state()
+        for name, old in expected.items():
+            new = arrays.get(name)
+            if new is None or new.shape != old.shape or new.dtype != old.dtype:
+                got = "missing" if new is None else f"{new.shape} {new.dtype}"
+                raise ArtifactError(
+                    f"field state: {name} is {got}, expected {old.shape} {old.dtype}; "
+                    "it belongs to other bounds or settings"
+                )
+        with torch.no_grad():
+            for name, p in self.named_parameters():
+                p.copy_(torch.from_numpy(np.ascontiguousarray(arrays[name])))
+        self.visits = arrays["visits"].copy()
+
+
+def _as_points(points: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(points, dtype=np.float32).reshape(-1, 3)
