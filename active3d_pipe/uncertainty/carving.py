@@ -1,0 +1,74 @@
+"""Running free and hit evidence from depth frames, and how well each surface voxel was seen."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from active3d_pipe.structures import Camera, Frame, VoxelGrid
+from active3d_pipe.uncertainty import kernels
+from active3d_pipe.uncertainty.config import UncertaintySettings
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RayEvidence:
+    """What depth rays said about every voxel; float32 [X, Y, Z] on one grid.
+
+    Attributes:
+        free: number of rays that passed through the voxel.
+        hit: number of rays that ended in it.
+        quality: best observation of its surface, 0 = never hit, 1 = frontal, with pixels no wider than the reference.
+    """
+
+    free: np.ndarray
+    hit: np.ndarray
+    quality: np.ndarray
+
+    @classmethod
+    def none(cls, grid: VoxelGrid) -> "RayEvidence":
+        """No ray so far."""
+        return cls(*(np.zeros(grid.shape, np.float32) for _ in range(3)))
+
+    def joined(self, newer: "RayEvidence") -> "RayEvidence":
+        """Both together: counts add up, the better view stays."""
+        return RayEvidence(
+            self.free + newer.free, self.hit + newer.hit, np.maximum(self.quality, newer.quality)
+        )
+
+
+def integrate_depth(grid: VoxelGrid, frames: Sequence[Frame], settings: UncertaintySettings) -> RayEvidence:
+    """Evidence of `frames` alone, by traversal of the grid along every `ray_stride`-th pixel's ray.
+
+    A ray counts at most once per voxel. A voxel in which some ray of a frame ends is not counted free by other rays
+    of the same frame (they graze it). Depth 0 or below `near` says nothing; depth beyond `far` carves up to `far`
+    and hits nothing. The sampled pixels shift with the step, so that successive frames fill each other's gaps.
+
+    View quality is (cosine of incidence) x min(1, reference footprint / pixel width on the surface), with normals
+    from the depth image itself.
+    """
+    shape = (kernels.CHUNKS, *grid.shape)
+    free, hit = np.zeros(shape, np.int32), np.zeros(shape, np.int32)
+    quality = np.zeros(shape, np.float32)
+    s = settings.ray_stride
+    for group in by_image_size(frames):
+        starts = np.array([(f.step // s % s, f.step % s) for f in group], np.int64)
+        kernels.carve_frames(
+            np.stack([f.depth for f in group]), intrinsics([f.camera for f in group]),
+            np.stack([f.T_world_camera for f in group])[:, :3].astype(np.float64),
+            np.array([(f.camera.near, f.camera.far) for f in group], np.float64), starts, s,
+            grid.origin, 1 / grid.voxel_size, settings.reference_footprint_m, free, hit, quality,
+        )
+    return RayEvidence(free.sum(0).astype(np.float32), hit.sum(0).astype(np.float32), quality.max(0))
+
+
+def by_image_size(items: Sequence) -> Iterator[list]:
+    """Groups of frames or views whose images share one size, in order of first appearance."""
+    groups: dict[tuple[int, int], list] = {}
+    for item in items:
+        groups.setdefault(item.depth.shape, []).append(item)
+    yield from groups.values()
+
+
+def intrinsics(cameras: Sequence[Camera]) -> np.ndarray:
+    """(N, 4) float64 fx, fy, cx, cy."""
+    return np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras], np.float64)

@@ -1,0 +1,149 @@
+"""The uncertainty volume of one round: the algorithm on one page (paper, sec. uncertainty_map)."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from scipy.special import expit
+
+from active3d_pipe.errors import InputError, NumericalError
+from active3d_pipe.structures import Frame, GaussianModel, UncertaintyVolume, VoxelGrid
+from active3d_pipe.uncertainty import explicit, fusion, implicit, occupancy, temporal
+from active3d_pipe.uncertainty.carving import RayEvidence, integrate_depth
+from active3d_pipe.uncertainty.config import UncertaintySettings
+from active3d_pipe.uncertainty.explicit import ViewResidual
+
+FieldQuery = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+def make_grid(low: np.ndarray, high: np.ndarray, settings: UncertaintySettings) -> VoxelGrid:
+    """The grid of every volume: the bounds [low, high] (world, m) widened by `margin_m`."""
+    margin = settings.margin_m
+    return VoxelGrid.from_bounds(np.asarray(low) - margin, np.asarray(high) + margin, settings.voxel_size_m)
+
+
+def compute_volume(  # noqa: PLR0913  (the inputs of the stage, by name)
+    *,
+    grid: VoxelGrid,
+    round: int,
+    previous: UncertaintyVolume | None,
+    field_query: FieldQuery,
+    gaussians: GaussianModel,
+    new_frames: Sequence[Frame],
+    views: Sequence[ViewResidual],
+    predicted: Sequence[ViewResidual],
+    settings: UncertaintySettings,
+) -> UncertaintyVolume:
+    """Volume of round `round` from the map of this round and everything that was observed so far.
+
+    Unseen space is uncertain; seen free space is not, whatever the field invents there. All u are in 0..1 before
+    fusion: u_imp = 1 where unseen, u_exp 1 = residual far above its scale, u_time 1 = full change of the SDF;
+    u_final is in units of the normalised residual that it predicts.
+
+    Args:
+        grid: of every volume; `previous` must be on the same one.
+        previous: volume of the last round, None in the first: it carries the evidence and the fusion statistics.
+        field_query: world points (N, 3) float32, m -> (sdf, sigma), (N,) each, m.
+        gaussians: the explicit branch of this round's map.
+        new_frames: frames captured since `previous`.
+        views: renderings of keyframes with this round's map against their images.
+        predicted: renderings of the *previous* map at the poses of new frames, against those frames.
+
+    Raises:
+        InputError: `previous` is on another grid, or `field_query` returns the wrong number of values.
+        NumericalError: the field returns NaN or infinite values.
+    """
+    _check_grid(grid, previous)
+    before = RayEvidence.none(grid) if previous is None else _evidence_of(previous)
+    fresh = integrate_depth(grid, new_frames, settings)
+    evidence = before.joined(fresh)
+
+    sdf, sigma = _query(grid, field_query)
+    observed = occupancy.observation(evidence, settings)
+    attention = occupancy.attention(evidence, settings)
+    p_imp = implicit.implicit_occupancy(sdf, sigma, observed, grid.voxel_size, settings)
+    log_odds = occupancy.explicit_log_odds(evidence, occupancy.opacity_mass(grid, gaussians), settings)
+    entropy_imp = attention * occupancy.entropy_bits(p_imp)
+    entropy_exp = occupancy.entropy_bits(expit(log_odds))
+
+    u_imp = attention * implicit.implicit_uncertainty(sigma, observed, settings)
+    last_u_exp = None if previous is None else previous["u_exp"]
+    u_exp = attention * explicit.explicit_uncertainty(grid, views, last_u_exp, settings)
+    u_time = np.zeros(grid.shape, np.float32)
+    if previous is not None:
+        # A field that moves in space known to be free before and after is a phantom; space freed now is news.
+        relevant = observed * np.maximum(attention, occupancy.attention(before, settings))
+        u_time = temporal.temporal_uncertainty(sdf, previous["sdf"], previous["u_time"], relevant, settings)
+
+    rows, targets = revealed_rows(grid, previous, fresh, predicted, settings)
+    statistics = _statistics_of(previous).updated(rows, targets, settings.forgetting)
+    fused = fusion.fuse(statistics, settings)
+    a = fused.alphas.astype(np.float32)
+
+    arrays = {
+        "u_imp": u_imp,
+        "u_exp": u_exp,
+        "u_time": u_time,
+        "u_final": a[0] * u_imp + a[1] * u_exp + a[2] * u_time,
+        "occupancy": occupancy.hybrid_occupancy(log_odds, p_imp, evidence, settings),
+        "entropy_imp": entropy_imp,
+        "entropy_exp": entropy_exp,
+        "entropy": np.float32(settings.lambda_imp) * entropy_imp + np.float32(settings.lambda_exp) * entropy_exp,
+        "sdf": sdf,
+        "free_evidence": evidence.free,
+        "hit_evidence": evidence.hit,
+        "view_quality": evidence.quality,
+    }
+    arrays = {name: np.ascontiguousarray(array, dtype=np.float32) for name, array in arrays.items()}
+    return UncertaintyVolume(grid, round, arrays, fused.to_json(statistics, len(targets)))
+
+
+def revealed_rows(
+    grid: VoxelGrid, previous: UncertaintyVolume | None, fresh: RayEvidence, predicted: Sequence[ViewResidual],
+    settings: UncertaintySettings,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (N, 3) of the last round's u_imp, u_exp, u_time and targets (N,): the realised residual.
+
+    One row for every voxel in which rays of the new frames ended and that a prediction covers, whether it was seen
+    before or not.
+    """
+    if previous is None or not predicted:
+        return np.zeros((0, 3)), np.zeros(0)
+    residual, coverage = explicit.backproject(grid, predicted, settings)
+    revealed = (fresh.hit > 0) & (coverage > 0)
+    rows = np.stack([previous[f"u_{name}"][revealed] for name in fusion.TERMS], axis=-1)
+    return rows, residual[revealed]
+
+
+def _query(grid: VoxelGrid, field_query: FieldQuery) -> tuple[np.ndarray, np.ndarray]:
+    """SDF and sigma at all voxel centres, float32 [X, Y, Z], m."""
+    values = field_query(grid.centres().reshape(-1, 3))
+    out = []
+    for name, value in zip(("sdf", "sigma"), values, strict=True):
+        a = np.asarray(value, dtype=np.float32)
+        if a.size != grid.size:
+            raise InputError(f"uncertainty: the field returned {a.size} values of {name}, expected {grid.size}")
+        if not np.isfinite(a).all():
+            raise NumericalError(f"uncertainty: {name} of the field holds NaN or infinite values")
+        out.append(a.reshape(grid.shape))
+    return out[0], out[1]
+
+
+def _check_grid(grid: VoxelGrid, previous: UncertaintyVolume | None) -> None:
+    if previous is None:
+        return
+    p = previous.grid
+    if p.shape != grid.shape or p.voxel_size != grid.voxel_size or not np.array_equal(p.origin, grid.origin):
+        raise InputError(
+            f"uncertainty: the volume of round {previous.round} is on grid {p.shape} at {p.origin.tolist()}, "
+            f"expected {grid.shape} at {grid.origin.tolist()}; use one grid for the whole run"
+        )
+
+
+def _evidence_of(volume: UncertaintyVolume) -> RayEvidence:
+    return RayEvidence(volume["free_evidence"], volume["hit_evidence"], volume["view_quality"])
+
+
+def _statistics_of(previous: UncertaintyVolume | None) -> fusion.FusionStatistics:
+    if previous is None or "statistics" not in previous.fusion:
+        return fusion.FusionStatistics.empty()
+    return fusion.FusionStatistics.from_json(previous.fusion["statistics"])
