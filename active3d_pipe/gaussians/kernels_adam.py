@@ -1,0 +1,45 @@
+"""Numba kernel: Adam over all parameters of all primitives in one sweep."""
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+F = np.float32
+ZERO, ONE = F(0), F(1)
+CHUNKS = 64
+# Far below any gradient; keeps m / sqrt(v) finite.
+EPSILON = F(1e-15)
+# Moments of long unseen primitives decay into denormal numbers, which are slow; they are cut off here.
+TINY = F(1e-30)
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+def adam(values, moment1, moment2, steps, grad, rates, beta1, beta2, visible_only, visible):
+    """One Adam step (Kingma & Ba 2015) on `values` (N, 14), in place.
+
+    `steps` (N,) int32 counts the updates of each primitive, so that the bias correction fits those that were
+    added later; `rates` (14,) learning rates; `visible` (N,) bool is read when `visible_only`.
+    """
+    n, width = values.shape
+    one_less_1, one_less_2 = ONE - beta1, ONE - beta2
+    for c in prange(CHUNKS):
+        for i in range(n * c // CHUNKS, n * (c + 1) // CHUNKS):
+            if visible_only and not visible[i]:
+                continue
+            steps[i] += 1
+            t = F(steps[i])
+            # Both corrections are 1 within float32 after that many steps.
+            if steps[i] < 20000:
+                correct1, correct2 = ONE - beta1**t, ONE / math.sqrt(ONE - beta2**t)
+            else:
+                correct1, correct2 = ONE, ONE
+            step = ONE / correct1
+            for j in range(width):
+                g = grad[i, j]
+                m = beta1 * moment1[i, j] + one_less_1 * g
+                v = beta2 * moment2[i, j] + one_less_2 * g * g
+                m = m if abs(m) > TINY else ZERO
+                moment1[i, j] = m
+                moment2[i, j] = v
+                values[i, j] -= rates[j] * step * m / (math.sqrt(v) * correct2 + EPSILON)

@@ -1,0 +1,153 @@
+"""The Gaussians while they are optimised: one packed tensor, Adam's moments, and what a resume needs."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from active3d_pipe.errors import ArtifactError
+from active3d_pipe.gaussians import kernels_adam
+from active3d_pipe.gaussians.config import GaussianSettings
+from active3d_pipe.gaussians.raster_pass import Workspace
+from active3d_pipe.structures import GaussianModel
+
+MEANS, LOG_SCALES, QUATS = slice(0, 3), slice(3, 6), slice(6, 10)
+OPACITY_LOGITS, COLORS = 10, slice(11, 14)
+WIDTH = 14
+
+
+class GaussianParameters:
+    """N Gaussians and the state of their optimiser.
+
+    Attributes:
+        values: (N, 14) float32, one row per primitive: mean (world, m) 0:3, log-scale 3:6, quaternion wxyz 6:10,
+            opacity logit 10, colour 11:14. `means`, `log_scales`, `quats`, `opacity_logits`, `colors` are
+            writable views of its columns.
+        moment1, moment2: (N, 14) float32, Adam's moments.
+        steps: (N,) int32, number of Adam steps each primitive has taken; new ones start at 0.
+        workspace: buffers of the kernels; no part of the state.
+    """
+
+    def __init__(self, values: Tensor, moment1: Tensor, moment2: Tensor, steps: Tensor) -> None:
+        self.values = values
+        self.moment1 = moment1
+        self.moment2 = moment2
+        self.steps = steps
+        self.workspace = Workspace()
+
+    @classmethod
+    def from_model(cls, model: GaussianModel) -> "GaussianParameters":
+        """Parameters that hold a copy of `model`; moments and steps start at zero."""
+        values = torch.from_numpy(_pack(model))
+        zeros = torch.zeros_like(values)
+        return cls(values, zeros, zeros.clone(), torch.zeros(len(values), dtype=torch.int32))
+
+    def to_model(self) -> GaussianModel:
+        """A copy as plain arrays."""
+        v = self.values.detach().numpy()
+        columns = (MEANS, LOG_SCALES, QUATS, OPACITY_LOGITS, COLORS)
+        return GaussianModel(*(np.ascontiguousarray(v[:, c]).copy() for c in columns))
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    @property
+    def means(self) -> Tensor:
+        """(N, 3) world, m; a view."""
+        return self.values[:, MEANS]
+
+    @property
+    def log_scales(self) -> Tensor:
+        """(N, 3) natural logarithm of the standard deviations, m; a view."""
+        return self.values[:, LOG_SCALES]
+
+    @property
+    def quats(self) -> Tensor:
+        """(N, 4) local -> world, wxyz, not normalised; a view."""
+        return self.values[:, QUATS]
+
+    @property
+    def opacity_logits(self) -> Tensor:
+        """(N,) opacity = sigmoid(logit); a view."""
+        return self.values[:, OPACITY_LOGITS]
+
+    @property
+    def colors(self) -> Tensor:
+        """(N, 3) display colour; a view."""
+        return self.values[:, COLORS]
+
+    def append(self, model: GaussianModel) -> None:
+        """Add the primitives of `model` at the end; their moments and step counts start at zero."""
+        if len(model) == 0:
+            return
+        new = torch.from_numpy(_pack(model))
+        zeros = torch.zeros_like(new)
+        self.values = torch.cat([self.values.detach(), new])
+        self.moment1 = torch.cat([self.moment1, zeros])
+        self.moment2 = torch.cat([self.moment2, zeros])
+        self.steps = torch.cat([self.steps, torch.zeros(len(new), dtype=torch.int32)])
+
+    def keep(self, mask: np.ndarray) -> None:
+        """Drop the primitives where `mask` (N,) bool is False; the others keep order and optimiser state."""
+        if mask.all():
+            return
+        kept = torch.from_numpy(np.flatnonzero(mask))
+        self.values = self.values.detach()[kept]
+        self.moment1, self.moment2, self.steps = self.moment1[kept], self.moment2[kept], self.steps[kept]
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Everything a later `from_state` needs to go on with the same bytes."""
+        return {
+            "values": self.values.detach().numpy().copy(),
+            "moment1": self.moment1.numpy().copy(),
+            "moment2": self.moment2.numpy().copy(),
+            "steps": self.steps.numpy().copy(),
+        }
+
+    @classmethod
+    def from_state(cls, state: dict[str, np.ndarray]) -> "GaussianParameters":
+        """Inverse of `state`; raises ArtifactError on missing, misshapen or mistyped arrays."""
+        arrays = []
+        n = len(state["values"]) if "values" in state else 0
+        shapes = {"values": (n, WIDTH), "moment1": (n, WIDTH), "moment2": (n, WIDTH), "steps": (n,)}
+        for name, shape in shapes.items():
+            a = state.get(name)
+            dtype = np.int32 if name == "steps" else np.float32
+            if a is None or a.shape != shape or a.dtype != dtype:
+                got = "missing" if a is None else f"{a.shape} {a.dtype}"
+                raise ArtifactError(f"optimiser state: {name} is {got}, expected {shape} {np.dtype(dtype)}")
+            arrays.append(torch.from_numpy(a.copy()))
+        return cls(*arrays)
+
+    def step(
+        self,
+        grads: np.ndarray | Tensor,
+        settings: GaussianSettings,
+        learning_rate_scale: float = 1.0,
+        visible: np.ndarray | None = None,
+    ) -> None:
+        """One Adam step with dL/dvalues `grads` (N, 14) float32.
+
+        Args:
+            grads: gradient of the loss.
+            settings: learning rates and decays.
+            learning_rate_scale: factor on all learning rates (annealing).
+            visible: (N,) bool; with `settings.visible_only`, primitives outside it stay as they are.
+        """
+        grad = grads.numpy() if isinstance(grads, Tensor) else grads
+        rates = np.empty(WIDTH, np.float32)
+        rates[MEANS], rates[LOG_SCALES], rates[QUATS] = settings.lr_means_m, settings.lr_log_scales, settings.lr_quats
+        rates[OPACITY_LOGITS], rates[COLORS] = settings.lr_opacity_logits, settings.lr_colors
+        selective = settings.visible_only and visible is not None
+        kernels_adam.adam(
+            self.values.detach().numpy(), self.moment1.numpy(), self.moment2.numpy(), self.steps.numpy(),
+            np.ascontiguousarray(grad, dtype=np.float32), rates * np.float32(learning_rate_scale),
+            np.float32(settings.adam_beta1), np.float32(settings.adam_beta2),
+            selective, visible if selective else np.zeros(0, bool),  # type: ignore[arg-type]
+        )
+
+
+def _pack(model: GaussianModel) -> np.ndarray:
+    """(N, 14) float32 rows of a model."""
+    return np.concatenate(
+        [model.means, model.log_scales, model.quats, model.opacity_logits[:, None], model.colors], axis=1
+    ).astype(np.float32)
