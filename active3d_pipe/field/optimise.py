@@ -102,7 +102,7 @@ def field_step(
         "smoothness": settings.weight_smoothness,
     }
     total = torch.stack([terms[name] * weight for name, weight in weights.items()]).sum()
-    values = {name: float(term) for name, term in terms.items()} | {"total": float(total)}
+    values = {name: term.item() for name, term in terms.items()} | {"total": total.item()}
     if not np.isfinite(values["total"]):
         raise NumericalError(f"field: the loss is not finite ({values}); lower the learning rates")
     forward = perf_counter()
