@@ -4,6 +4,8 @@ Work is split over a fixed number of chunks (`CHUNKS`), each with volumes of its
 the same bytes come out whatever the number of threads. No fastmath: depth may hold NaN, and must be told apart.
 """
 
+# mypy: disable-error-code=no-untyped-def
+
 import math
 
 import numpy as np

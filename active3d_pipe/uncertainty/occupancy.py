@@ -12,13 +12,6 @@ from active3d_pipe.uncertainty.carving import RayEvidence
 from active3d_pipe.uncertainty.config import UncertaintySettings
 
 
-def entropy_bits(p: np.ndarray) -> np.ndarray:
-    """Shannon entropy of Bernoulli(p) in bits, 0..1, same shape; 0 at p = 0 and p = 1."""
-    p = np.clip(p, np.float32(1e-7), np.float32(1 - 1e-7))
-    h = -(p * np.log2(p) + (1 - p) * np.log2(1 - p))
-    return np.clip(h, 0, 1).astype(np.float32)
-
-
 def observation(evidence: RayEvidence, settings: UncertaintySettings) -> np.ndarray:
     """Share of observation, 0 where no ray went, towards 1 with the number of rays; float32 [X, Y, Z]."""
     return -np.expm1((evidence.free + evidence.hit) * np.float32(-1 / settings.observation_rays))

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.special import expit
 
 from active3d_pipe.errors import InputError, NumericalError
+from active3d_pipe.information.entropy import bernoulli_entropy
 from active3d_pipe.structures import Frame, GaussianModel, UncertaintyVolume, VoxelGrid
 from active3d_pipe.uncertainty import explicit, fusion, implicit, occupancy, temporal
 from active3d_pipe.uncertainty.carving import RayEvidence, integrate_depth
@@ -62,8 +63,8 @@ def compute_volume(  # noqa: PLR0913  (the inputs of the stage, by name)
     attention = occupancy.attention(evidence, settings)
     p_imp = implicit.implicit_occupancy(sdf, sigma, observed, grid.voxel_size, settings)
     log_odds = occupancy.explicit_log_odds(evidence, occupancy.opacity_mass(grid, gaussians), settings)
-    entropy_imp = attention * occupancy.entropy_bits(p_imp)
-    entropy_exp = occupancy.entropy_bits(expit(log_odds))
+    entropy_imp = attention * bernoulli_entropy(p_imp)
+    entropy_exp = bernoulli_entropy(expit(log_odds))
 
     u_imp = attention * implicit.implicit_uncertainty(sigma, observed, settings)
     last_u_exp = None if previous is None else previous["u_exp"]

@@ -1,0 +1,148 @@
+"""Ray evidence against exact segment / voxel intersection."""
+
+import numpy as np
+import pytest
+from uncertainty_room import CAMERA, SIZE, frame, frames, pose, room_grid, trace
+
+from active3d_pipe.geometry import projection, se3, voxel_traversal
+from active3d_pipe.structures import Camera, Frame, VoxelGrid
+from active3d_pipe.uncertainty import UncertaintySettings, integrate_depth
+
+EVERY_PIXEL = UncertaintySettings(ray_stride=1)
+
+
+def crossing_length(grid, o, e):
+    """(X, Y, Z) length of the segment o -> e (voxel units, as a share of it) inside every voxel: slab test."""
+    d = e - o
+    t0, t1 = np.zeros(grid.shape), np.ones(grid.shape)
+    for axis in range(3):
+        low = np.arange(grid.shape[axis], dtype=np.float64)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            a, b = (low - o[axis]) / d[axis], (low + 1 - o[axis]) / d[axis]
+        shape = [1, 1, 1]
+        shape[axis] = -1
+        t0 = np.maximum(t0, np.minimum(a, b).reshape(shape))
+        t1 = np.minimum(t1, np.maximum(a, b).reshape(shape))
+    return t1 - t0
+
+
+def slow_evidence(grid, f):
+    """Free counts, hit counts, and voxels that some ray touches by less than rounding can tell."""
+    free, hit, unsure = (np.zeros(grid.shape, int) for _ in range(3))
+    ends, rays = [], []
+    points = se3.transform_points(f.T_world_camera, projection.pixel_rays(f.camera).astype(float) * f.depth[..., None])
+    o = (f.T_world_camera[:3, 3] - grid.origin) / grid.voxel_size
+    for point, d in zip(points.reshape(-1, 3), f.depth.ravel()):
+        if d <= 0:
+            continue
+        e = (point - grid.origin) / grid.voxel_size
+        rays.append(crossing_length(grid, o, e))
+        ijk = np.floor(e).astype(int)
+        if grid.contains_index(ijk):
+            hit[tuple(ijk)] += 1
+            ends.append(e)
+    for length in rays:
+        free += (length > 0) & (hit == 0)
+        unsure += np.abs(length) < 1e-5
+    for e in ends:
+        if np.abs(e - np.round(e)).min() < 1e-4:
+            unsure[tuple(np.floor(e - 1e-3).astype(int))] += 1
+            unsure[tuple(np.floor(e + 1e-3).astype(int))] += 1
+    return free, hit, unsure > 0
+
+
+@pytest.mark.parametrize(("yaw", "position"), [(17.0, (0.9, 1.1, 1.2)), (-140.0, (1.2, 1.9, 0.6)), (0.0, (-0.9, 1.1, 1.2))])
+def test_counts_equal_exact_intersection(yaw, position):
+    grid = room_grid(0.19)
+    camera = Camera.from_fov(16, 12, 90)
+    T = pose(yaw, position)
+    depth = trace(T, camera)
+    depth[3, 4] = 0
+    f = Frame(0, 0, camera, T, np.zeros((12, 16, 3), np.uint8), depth)
+    got = integrate_depth(grid, [f], EVERY_PIXEL)
+    free, hit, unsure = slow_evidence(grid, f)
+    assert hit.sum() > 50
+    assert free.sum() > 300
+    assert unsure.mean() < 0.05
+    np.testing.assert_array_equal(got.free[~unsure], free[~unsure])
+    np.testing.assert_array_equal(got.hit[~unsure], hit[~unsure])
+
+
+def test_agrees_with_the_traversal_of_the_planner():
+    """Two implementations: there grazing rays count as free in hit voxels, else the counts are the same."""
+    grid, f = room_grid(0.09), frame(0, pose(17.0))
+    got = integrate_depth(grid, [f], EVERY_PIXEL)
+    free, hit = voxel_traversal.carve(grid, f.T_world_camera, f.camera, f.depth)
+    assert np.abs(got.hit - hit).sum() <= 0.002 * hit.sum()
+    elsewhere = (got.hit == 0) & (hit == 0)
+    assert np.abs(got.free - free)[elsewhere].sum() <= 0.002 * free.sum()
+
+
+def test_a_hit_voxel_is_not_free_in_the_same_frame():
+    got = integrate_depth(room_grid(), frames((10,)), EVERY_PIXEL)
+    assert got.free[got.hit > 0].max() == 0
+
+
+def test_invalid_depth_says_nothing_and_far_depth_hits_nothing():
+    grid, T = room_grid(), pose(0)
+    rgb = np.zeros((60, 80, 3), np.uint8)
+    for bad in (0.0, np.nan, np.inf, -1.0):
+        f = Frame(0, 0, CAMERA, T, rgb, np.full((60, 80), bad, np.float32))
+        got = integrate_depth(grid, [f], EVERY_PIXEL)
+        assert not got.free.any()
+        assert not got.hit.any()
+    near = Camera.from_fov(80, 60, 90, far=1.0)
+    got = integrate_depth(grid, [Frame(0, 0, near, T, rgb, trace(T) + 5)], EVERY_PIXEL)
+    assert not got.hit.any()
+    z = projection.project(grid.centres(), T, near)[1]
+    assert got.free.sum() > 100
+    assert z[got.free > 0].max() < 1.0 + grid.voxel_size
+
+
+def test_free_space_is_free_and_walls_are_hit():
+    grid = room_grid()
+    got = integrate_depth(grid, frames(range(0, 360, 40)), UncertaintySettings(ray_stride=2))
+    centres = grid.centres()
+    beyond = (centres < -0.1).any(-1) | (centres > SIZE + 0.1).any(-1)
+    assert not got.free[beyond].any()
+    assert not got.hit[beyond].any()
+    assert got.hit.sum() > 5000
+
+
+def test_counts_only_grow_add_up_and_do_not_depend_on_order():
+    grid, fs = room_grid(), frames((-40, 0, 20, 90, 170))
+    s = UncertaintySettings()
+    both, first, second = (integrate_depth(grid, part, s) for part in (fs, fs[:2], fs[2:]))
+    joined = first.joined(second)
+    for name in ("free", "hit", "quality"):
+        np.testing.assert_array_equal(getattr(both, name), getattr(joined, name))
+        assert (getattr(both, name) >= getattr(first, name)).all()
+        assert getattr(integrate_depth(grid, fs[::-1], s), name).tobytes() == getattr(both, name).tobytes()
+
+
+def test_frames_of_several_cameras_mix():
+    grid = room_grid()
+    small = Camera.from_fov(40, 30, 70)
+    fs = [frame(0, pose(0)), frame(1, pose(60), small), frame(2, pose(-60))]
+    s = UncertaintySettings()
+    got = integrate_depth(grid, fs, s)
+    alone = [integrate_depth(grid, [f], s) for f in fs]
+    np.testing.assert_array_equal(got.free, sum(a.free for a in alone))
+
+
+@pytest.mark.parametrize(("angle", "distance"), [(0, 1.0), (0, 2.01), (45, 1.0), (60, 1.51)])
+def test_quality_is_incidence_times_resolution(angle, distance):
+    """A plane at `distance` along the optical axis, turned by `angle` about the vertical."""
+    camera = Camera.from_fov(81, 61, 60)
+    n = np.array([np.sin(np.radians(angle)), 0, np.cos(np.radians(angle))])
+    rays = projection.pixel_rays(camera)
+    depth = (distance * n[2] / np.maximum(rays @ n, 0.05)).astype(np.float32)
+    grid = VoxelGrid(np.array([-0.05, -0.05, 0.0]), 0.02, (5, 5, 150))
+    s = UncertaintySettings(ray_stride=1, reference_footprint_m=0.01)
+    f = Frame(0, 0, camera, np.eye(4), np.zeros((61, 81, 3), np.uint8), depth)
+    got = integrate_depth(grid, [f], s)
+    middle = got.quality[2, 2].max()
+    expected = np.cos(np.radians(angle)) * min(1, 0.01 * camera.fx / distance)
+    assert middle == pytest.approx(expected, rel=0.03)
+    assert ((got.quality > 0) == (got.hit > 0)).all()
+    assert got.quality.max() <= 1
