@@ -1,1 +1,1 @@
-
+"""The explicit branch: Gaussian parameters, rasteriser, losses, seeding, pruning."""

@@ -8,64 +8,86 @@ from active3d_pipe.structures import Settings
 class GaussianSettings(Settings):
     """Gaussian model: rendering, losses, optimisation, seeding, pruning."""
 
-    max_count: int = Field(400_000, ge=1, description="most primitives the model may hold")
+    max_count: int = Field(default=400_000, ge=1, description="most primitives the model may hold")
 
     # Rendering
     dilation_px2: float = Field(
-        0.1, ge=0, description="variance added to every projected covariance, square pixels (anti-aliasing)"
+        default=0.1, ge=0, description="variance added to every projected covariance, square pixels (anti-aliasing)"
     )
     opacity_compensation: bool = Field(
-        True, description="scale opacity by the ratio of areas before and after the dilation (Mip-Splatting)"
+        default=True, description="scale opacity by the ratio of areas before and after the dilation (Mip-Splatting)"
     )
 
     # Losses
-    ssim_weight: float = Field(0.2, ge=0, le=1, description="w of (1 - w) L1 + w (1 - SSIM)")
-    depth_weight: float = Field(0.3, ge=0, description="weight of the mean absolute depth error, per metre")
+    ssim_weight: float = Field(default=0.2, ge=0, le=1, description="w of (1 - w) L1 + w (1 - SSIM)")
+    depth_weight: float = Field(
+        default=0.3, ge=0, description="weight of the mean absolute depth error, per metre"
+    )
 
     # Optimisation (Adam)
-    lr_means_m: float = Field(8e-4, ge=0, description="learning rate of the means, m")
-    lr_log_scales: float = Field(0.03, ge=0, description="learning rate of the logarithmic scales")
-    lr_quats: float = Field(8e-3, ge=0, description="learning rate of the quaternions")
-    lr_opacity_logits: float = Field(0.05, ge=0, description="learning rate of the opacity logits")
-    lr_colors: float = Field(0.02, ge=0, description="learning rate of the colours")
-    adam_beta1: float = Field(0.9, ge=0, lt=1, description="decay of Adam's first moment")
-    adam_beta2: float = Field(0.999, ge=0, lt=1, description="decay of Adam's second moment")
+    lr_means_m: float = Field(default=8e-4, ge=0, description="learning rate of the means, m")
+    lr_log_scales: float = Field(default=0.03, ge=0, description="learning rate of the logarithmic scales")
+    lr_quats: float = Field(default=8e-3, ge=0, description="learning rate of the quaternions")
+    lr_opacity_logits: float = Field(default=0.05, ge=0, description="learning rate of the opacity logits")
+    lr_colors: float = Field(default=0.02, ge=0, description="learning rate of the colours")
+    adam_beta1: float = Field(default=0.9, ge=0, lt=1, description="decay of Adam's first moment")
+    adam_beta2: float = Field(default=0.999, ge=0, lt=1, description="decay of Adam's second moment")
     visible_only: bool = Field(
-        False, description="let Adam touch only the primitives that the view shows (cheaper for large models)"
+        default=False, description="let Adam touch only the primitives that the view shows (cheaper for large models)"
     )
 
     # Seeding from a frame
-    seed_cell_m: float = Field(0.048, gt=0, description="edge of the coarsest octree cell that becomes one disc, m")
-    seed_levels: int = Field(4, ge=1, le=8, description="octree levels; every level halves the cell")
+    seed_cell_m: float = Field(
+        default=0.048, gt=0, description="edge of the coarsest octree cell that becomes one disc, m"
+    )
+    seed_levels: int = Field(default=4, ge=1, le=8, description="octree levels; every level halves the cell")
     seed_color_spread: float = Field(
-        0.04, gt=0, description="split a cell when the standard deviation of its colour exceeds this (0..1 scale)"
+        default=0.04, gt=0, description="split a cell when its colour deviates by more (standard deviation, 0..1)"
     )
     seed_normal_cos: float = Field(
-        0.95, gt=0, le=1, description="split a cell when the mean of its unit normals is shorter than this"
+        default=0.95, gt=0, le=1, description="split a cell when the mean of its unit normals is shorter than this"
     )
-    seed_sigma_factor: float = Field(0.68, gt=0, description="in-plane sigma of a disc in units of its cell edge")
-    seed_flatness: float = Field(0.15, gt=0, le=1, description="sigma along the normal relative to in-plane sigma")
-    seed_opacity: float = Field(0.98, gt=0, lt=1, description="opacity of a new disc")
-    seed_alpha: float = Field(0.5, gt=0, le=1, description="seed where the rendered alpha is below this")
+    seed_sigma_factor: float = Field(
+        default=0.68, gt=0, description="in-plane sigma of a disc in units of its cell edge"
+    )
+    seed_flatness: float = Field(
+        default=0.15, gt=0, le=1, description="sigma along the normal relative to in-plane sigma"
+    )
+    seed_opacity: float = Field(default=0.98, gt=0, lt=1, description="opacity of a new disc")
+    seed_alpha: float = Field(
+        default=0.5, gt=0, le=1, description="seed where the rendered alpha is below this"
+    )
     seed_front_m: float = Field(
-        0.05, ge=0, description="seed where the observation is nearer than the rendered depth by this, m ..."
+        default=0.05, ge=0, description="seed where the observation is nearer than the rendered depth by this, m ..."
     )
-    seed_front_ratio: float = Field(0.03, ge=0, description="... plus this fraction of the depth")
+    seed_front_ratio: float = Field(default=0.03, ge=0, description="... plus this fraction of the depth")
     depth_edge_ratio: float = Field(
-        0.03, gt=0, description="relative depth step between neighbouring pixels that counts as a depth edge"
+        default=0.03, gt=0, description="relative depth step between neighbouring pixels that counts as a depth edge"
     )
 
     # Error-driven adding
-    add_color_error: float = Field(0.05, gt=0, description="add discs where the colour error exceeds this (0..1 scale)")
-    add_depth_error_m: float = Field(0.05, gt=0, description="add discs where the depth error exceeds this, m")
-    add_sigma_px: float = Field(1.0, gt=0, description="in-plane sigma of an added disc, px")
-    add_opacity: float = Field(0.5, gt=0, lt=1, description="opacity of an added disc")
+    add_color_error: float = Field(
+        default=0.05, gt=0, description="add discs where the colour error exceeds this (0..1 scale)"
+    )
+    add_depth_error_m: float = Field(
+        default=0.05, gt=0, description="add discs where the depth error exceeds this, m"
+    )
+    add_sigma_px: float = Field(default=1.0, gt=0, description="in-plane sigma of an added disc, px")
+    add_opacity: float = Field(default=0.5, gt=0, lt=1, description="opacity of an added disc")
 
     # Pruning
-    prune_opacity: float = Field(0.02, ge=0, lt=1, description="drop primitives less opaque than this")
-    prune_scale_m: float = Field(1.0, gt=0, description="drop primitives with a standard deviation above this, m")
+    prune_opacity: float = Field(
+        default=0.02, ge=0, lt=1, description="drop primitives less opaque than this"
+    )
+    prune_scale_m: float = Field(
+        default=1.0, gt=0, description="drop primitives with a standard deviation above this, m"
+    )
 
     # Coupling with the signed distance field
-    sdf_weight: float = Field(0.1, ge=0, description="weight of |SDF(mean)| in E_geo, per metre")
-    sdf_normal_weight: float = Field(0.01, ge=0, description="weight of the normal alignment in E_geo")
-    sdf_band_m: float = Field(0.05, gt=0, description="only means with |SDF| below this are coupled, m")
+    sdf_weight: float = Field(default=0.1, ge=0, description="weight of |SDF(mean)| in E_geo, per metre")
+    sdf_normal_weight: float = Field(
+        default=0.01, ge=0, description="weight of the normal alignment in E_geo"
+    )
+    sdf_band_m: float = Field(
+        default=0.05, gt=0, description="only means with |SDF| below this are coupled, m"
+    )

@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Numba kernel: Adam over all parameters of all primitives in one sweep."""
 
 import math
@@ -23,18 +24,16 @@ def adam(values, moment1, moment2, steps, grad, rates, beta1, beta2, visible_onl
     """
     n, width = values.shape
     one_less_1, one_less_2 = ONE - beta1, ONE - beta2
+    # Powers by exp(t log beta): LLVM turns a power with a whole exponent into a call that Numba cannot link.
+    log_beta1, log_beta2 = math.log(max(beta1, TINY)), math.log(max(beta2, TINY))
     for c in prange(CHUNKS):
         for i in range(n * c // CHUNKS, n * (c + 1) // CHUNKS):
             if visible_only and not visible[i]:
                 continue
             steps[i] += 1
             t = F(steps[i])
-            # Both corrections are 1 within float32 after that many steps.
-            if steps[i] < 20000:
-                correct1, correct2 = ONE - beta1**t, ONE / math.sqrt(ONE - beta2**t)
-            else:
-                correct1, correct2 = ONE, ONE
-            step = ONE / correct1
+            step = ONE / (ONE - math.exp(t * log_beta1))
+            correct2 = ONE / math.sqrt(ONE - math.exp(t * log_beta2))
             for j in range(width):
                 g = grad[i, j]
                 m = beta1 * moment1[i, j] + one_less_1 * g

@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Numba kernels: depth order of the records and their distribution to image tiles, without atomics."""
 
 import numpy as np

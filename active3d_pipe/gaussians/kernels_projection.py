@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Numba kernels: 3D Gaussians to screen-space records, and the chain rule back to their parameters.
 
 A primitive is one row of `values` (N, 14) float32: mean 0:3, log-scale 3:6, quaternion wxyz 6:10,

@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Numba kernels: alpha blending of the records, tile by tile, forward and backward.
 
 Backward walks front to back like forward and recomputes alpha, so nothing is stored per pixel: with S the
@@ -85,8 +86,8 @@ def forward(rec, entries, tile_start, tile_ids, bounds, tiles_x, t_stop, out, us
                 a, b, c = rec[r, 2], rec[r, 3], rec[r, 4]
                 o, smax, hy = rec[r, 5], rec[r, 6], rec[r, 7]
                 cr, cg, cb, cz = rec[r, 8], rec[r, 9], rec[r, 10], rec[r, 11]
-                r0 = max(0, int(math.ceil(v - hy - HALF)))
-                r1 = min(h, int(math.floor(v + hy - HALF)) + 1)
+                r0 = max(0, math.ceil(v - hy - HALF))
+                r1 = min(h, math.floor(v + hy - HALF) + 1)
                 for k in range(np.uint64(max(r0, 0) * TW), np.uint64(max(r1, 0) * TW)):
                     dx, dy = buf[np.uint64(PX) + k] - u, buf[np.uint64(PY) + k] - v
                     s = dx * (a * dx + b * dy) + c * dy * dy
@@ -166,8 +167,8 @@ def backward(rec, entries, tile_start, tile_ids, bounds, tiles_x, used, out, out
                 a, b, c = rec[r, 2], rec[r, 3], rec[r, 4]
                 o, smax, hy = rec[r, 5], rec[r, 6], rec[r, 7]
                 cr, cg, cb, cz = rec[r, 8], rec[r, 9], rec[r, 10], rec[r, 11]
-                r0 = max(0, int(math.ceil(v - hy - HALF)))
-                r1 = min(h, int(math.floor(v + hy - HALF)) + 1)
+                r0 = max(0, math.ceil(v - hy - HALF))
+                r1 = min(h, math.floor(v + hy - HALF) + 1)
                 m0, mx, my, mxx, mxy, myy = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
                 sr, sg, sb, sz = ZERO, ZERO, ZERO, ZERO
                 for k in range(np.uint64(max(r0, 0) * TW), np.uint64(max(r1, 0) * TW)):

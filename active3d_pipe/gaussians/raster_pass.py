@@ -121,6 +121,11 @@ class RasterPass:
         )
         return grad
 
+    @property
+    def num_visible(self) -> int:
+        """Number of primitives that the last `forward` projected onto a drawn image."""
+        return int(self._state["visible"])
+
     def visible(self) -> np.ndarray:
         """(N,) bool, primitives that the last `forward` projected onto a drawn image."""
         s = self._state

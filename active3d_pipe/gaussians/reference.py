@@ -3,6 +3,7 @@
 The kernels are tested against it for values and gradients.
 """
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -27,7 +28,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 def render_reference(
     values: Tensor,
     camera: Camera,
-    T_world_camera,  # noqa: ANN001 - array-like (4, 4)
+    T_world_camera: np.ndarray,
     *,
     dilation_px2: float = 0.1,
     compensate: bool = True,
