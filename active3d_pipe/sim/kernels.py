@@ -1,0 +1,358 @@
+"""Numba kernels of the renderer: shading with filtered textures, edge detection, rays. Slow twins: `reference.py`.
+
+Every output element is written by one iteration of a parallel loop and depends on inputs alone, so the same input
+gives the same bytes. Layouts of the packed scene are documented at `shading.PackedScene`.
+"""
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+NO_HIT = np.uint32(0xFFFFFFFF)
+_CHUNK = 512
+_ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
+
+
+@njit(inline="always", fastmath=True)
+def _wrap(i, n):
+    i = i % n
+    return i + n if i < 0 else i
+
+
+@njit(fastmath=True, cache=True)
+def _bilinear(texels, offset, width, height, u, v):
+    """RGBA in 0..255 at (u, v) of one mip level that repeats."""
+    x = u * width - _HALF
+    y = v * height - _HALF
+    fx, fy = np.float32(math.floor(x)), np.float32(math.floor(y))
+    ax, ay = x - fx, y - fy
+    x0, y0 = _wrap(np.int64(fx), width), _wrap(np.int64(fy), height)
+    x1 = x0 + 1 if x0 + 1 < width else 0
+    y1 = y0 + 1 if y0 + 1 < height else 0
+    p00, p10 = offset + y0 * width + x0, offset + y0 * width + x1
+    p01, p11 = offset + y1 * width + x0, offset + y1 * width + x1
+    w00, w10 = (_ONE - ax) * (_ONE - ay), ax * (_ONE - ay)
+    w01, w11 = (_ONE - ax) * ay, ax * ay
+    r = w00 * texels[p00, 0] + w10 * texels[p10, 0] + w01 * texels[p01, 0] + w11 * texels[p11, 0]
+    g = w00 * texels[p00, 1] + w10 * texels[p10, 1] + w01 * texels[p01, 1] + w11 * texels[p11, 1]
+    b = w00 * texels[p00, 2] + w10 * texels[p10, 2] + w01 * texels[p01, 2] + w11 * texels[p11, 2]
+    return r, g, b
+
+
+@njit(fastmath=True, cache=True)
+def filtered_texture(texels, levels, u, v, ux, vx, uy, vy, bias, max_probes):
+    """RGB (0..255) of a texture averaged over a pixel's footprint.
+
+    `levels` (L, 3) int64: offset into `texels`, width, height. (ux, vx), (uy, vy): change of (u, v) over one pixel to
+    the right and downwards. Trilinear mip lookups at probes along the footprint's long axis; the level fits its short
+    axis (Heckbert's footprint; "Feline"-style probes).
+    """
+    width, height = np.float32(levels[0, 1]), np.float32(levels[0, 2])
+    ax, ay = ux * width, vx * height
+    bx, by = uy * width, vy * height
+    # Axes of the ellipse J (unit disc), J = [a b]: eigen-decomposition of J J^T.
+    e, f, g = ax * ax + bx * bx, ax * ay + bx * by, ay * ay + by * by
+    mean, diff = _HALF * (e + g), _HALF * (e - g)
+    root = math.sqrt(diff * diff + f * f)
+    long2, short2 = mean + root, max(mean - root, np.float32(1e-12))
+    long, short = math.sqrt(long2), math.sqrt(short2)
+    if long <= _ONE:
+        return _bilinear(texels, levels[0, 0], levels[0, 1], levels[0, 2], u, v)
+    probes = min(np.int64(math.ceil(long / max(short, _ONE) - np.float32(1e-3))), max_probes)
+    probes = max(probes, 1)
+    extent = max(short, long / np.float32(probes), _ONE)
+    lod = min(max(np.float32(math.log2(extent)) + bias, _ZERO), np.float32(len(levels) - 1))
+    level = np.int64(lod)
+    blend = lod - np.float32(level)
+    # Direction of the long axis in texels, then in (u, v).
+    if root > np.float32(1e-9):
+        cx, cy = f, long2 - e
+        if diff > _ZERO:
+            cx, cy = long2 - g, f
+        norm = math.sqrt(cx * cx + cy * cy)
+        cx, cy = cx / norm, cy / norm
+    else:
+        cx, cy = _ONE, _ZERO
+    su, sv = cx * long / width, cy * long / height
+    r, gr, b = _ZERO, _ZERO, _ZERO
+    for i in range(probes):
+        s = (np.float32(i) + _HALF) / np.float32(probes) - _HALF
+        pu, pv = u + s * su, v + s * sv
+        r0, g0, b0 = _bilinear(texels, levels[level, 0], levels[level, 1], levels[level, 2], pu, pv)
+        if blend > np.float32(0.01):
+            k = level + 1
+            r1, g1, b1 = _bilinear(texels, levels[k, 0], levels[k, 1], levels[k, 2], pu, pv)
+            r0, g0, b0 = r0 + blend * (r1 - r0), g0 + blend * (g1 - g0), b0 + blend * (b1 - b0)
+        r, gr, b = r + r0, gr + g0, b + b0
+    inv = _ONE / np.float32(probes)
+    return r * inv, gr * inv, b * inv
+
+
+@njit(fastmath=True, cache=True)
+def _grid_value(grid, origin, inv_voxel, x, y, z):
+    """Trilinear value at a world point of a volume given at voxel centres, clamped at its borders."""
+    nx, ny, nz = grid.shape
+    gx = min(max((x - origin[0]) * inv_voxel - _HALF, _ZERO), np.float32(nx) - np.float32(1.001))
+    gy = min(max((y - origin[1]) * inv_voxel - _HALF, _ZERO), np.float32(ny) - np.float32(1.001))
+    gz = min(max((z - origin[2]) * inv_voxel - _HALF, _ZERO), np.float32(nz) - np.float32(1.001))
+    i, j, k = np.int64(gx), np.int64(gy), np.int64(gz)
+    a, b, c = gx - np.float32(i), gy - np.float32(j), gz - np.float32(k)
+    low = (grid[i, j, k] * (_ONE - a) + grid[i + 1, j, k] * a) * (_ONE - b) + (
+        grid[i, j + 1, k] * (_ONE - a) + grid[i + 1, j + 1, k] * a) * b
+    high = (grid[i, j, k + 1] * (_ONE - a) + grid[i + 1, j, k + 1] * a) * (_ONE - b) + (
+        grid[i, j + 1, k + 1] * (_ONE - a) + grid[i + 1, j + 1, k + 1] * a) * b
+    return low * (_ONE - c) + high * c
+
+
+@njit(fastmath=True, cache=True)
+def _brightness(px, py, pz, nx, ny, nz, lights, occlusion, grid, origin, inv_voxel):
+    """Fixed light on a surface point with unit normal towards the viewer: see `shading.LIGHTS`, `shading.OCCLUSION`."""
+    light = lights[0, 3]
+    for i in range(1, len(lights)):
+        light += lights[i, 3] * (nx * lights[i, 0] + ny * lights[i, 1] + nz * lights[i, 2])
+    shadow = _ZERO
+    for i in range(len(occlusion)):
+        h = occlusion[i, 0]
+        d = _grid_value(grid, origin, inv_voxel, px + h * nx, py + h * ny, pz + h * nz)
+        shadow += occlusion[i, 1] * max(_ONE - d / h, _ZERO)
+    return light * (_ONE - shadow)
+
+
+@njit(fastmath=True, cache=True)
+def _shade_one(n, rays, t, face, bary, right, down, scene, bias, max_probes, rgb, normal):
+    (vertices, faces, face_material, uv, corner_normal, vertex_colors, base_color, mip_range, levels, texels,
+     lights, occlusion, grid, origin, inv_voxel) = scene
+    f = face[n]
+    if f == NO_HIT:
+        for c in range(3):
+            rgb[n, c] = _ZERO
+            normal[n, c] = _ZERO
+        return
+    ox, oy, oz = rays[n, 0], rays[n, 1], rays[n, 2]
+    dx, dy, dz = rays[n, 3], rays[n, 4], rays[n, 5]
+    i0, i1, i2 = faces[f, 0], faces[f, 1], faces[f, 2]
+    e1x, e1y, e1z = (vertices[i1, 0] - vertices[i0, 0], vertices[i1, 1] - vertices[i0, 1],
+                     vertices[i1, 2] - vertices[i0, 2])
+    e2x, e2y, e2z = (vertices[i2, 0] - vertices[i0, 0], vertices[i2, 1] - vertices[i0, 1],
+                     vertices[i2, 2] - vertices[i0, 2])
+    gx, gy, gz = e1y * e2z - e1z * e2y, e1z * e2x - e1x * e2z, e1x * e2y - e1y * e2x
+    b1, b2 = bary[n, 0], bary[n, 1]
+    b0 = _ONE - b1 - b2
+    # Shading normal, on the viewer's side of the face.
+    q = np.float32(1.0 / 32767.0)
+    nx = q * (b0 * corner_normal[f, 0, 0] + b1 * corner_normal[f, 1, 0] + b2 * corner_normal[f, 2, 0])
+    ny = q * (b0 * corner_normal[f, 0, 1] + b1 * corner_normal[f, 1, 1] + b2 * corner_normal[f, 2, 1])
+    nz = q * (b0 * corner_normal[f, 0, 2] + b1 * corner_normal[f, 1, 2] + b2 * corner_normal[f, 2, 2])
+    facing = gx * dx + gy * dy + gz * dz
+    scale = _ONE / max(math.sqrt(nx * nx + ny * ny + nz * nz), np.float32(1e-12))
+    if facing > _ZERO:
+        scale = -scale
+    nx, ny, nz = nx * scale, ny * scale, nz * scale
+    normal[n, 0], normal[n, 1], normal[n, 2] = nx, ny, nz
+
+    m = face_material[f]
+    r, g, b = base_color[m, 0], base_color[m, 1], base_color[m, 2]
+    if mip_range[m, 1] > mip_range[m, 0]:
+        # Ray differentials on the face's plane (Igehy 1999): the footprint of one pixel in (u, v).
+        g2 = gx * gx + gy * gy + gz * gz
+        length = math.sqrt(g2)
+        least = np.float32(1e-3) * length
+        if abs(facing) < least:
+            facing = least
+        tt = t[n]
+        kx = (gx * right[0] + gy * right[1] + gz * right[2]) / facing
+        ky = (gx * down[0] + gy * down[1] + gz * down[2]) / facing
+        px, py, pz = tt * (right[0] - kx * dx), tt * (right[1] - kx * dy), tt * (right[2] - kx * dz)
+        sx, sy, sz = tt * (down[0] - ky * dx), tt * (down[1] - ky * dy), tt * (down[2] - ky * dz)
+        inv = _ONE / max(g2, np.float32(1e-30))
+        c1x, c1y, c1z = (e2y * gz - e2z * gy) * inv, (e2z * gx - e2x * gz) * inv, (e2x * gy - e2y * gx) * inv
+        c2x, c2y, c2z = (gy * e1z - gz * e1y) * inv, (gz * e1x - gx * e1z) * inv, (gx * e1y - gy * e1x) * inv
+        p1, p2 = c1x * px + c1y * py + c1z * pz, c2x * px + c2y * py + c2z * pz
+        s1, s2 = c1x * sx + c1y * sy + c1z * sz, c2x * sx + c2y * sy + c2z * sz
+        u0, v0 = uv[f, 0, 0], uv[f, 0, 1]
+        du1, dv1 = uv[f, 1, 0] - u0, uv[f, 1, 1] - v0
+        du2, dv2 = uv[f, 2, 0] - u0, uv[f, 2, 1] - v0
+        tr, tg, tb = filtered_texture(
+            texels, levels[mip_range[m, 0]:mip_range[m, 1]], u0 + b1 * du1 + b2 * du2, v0 + b1 * dv1 + b2 * dv2,
+            p1 * du1 + p2 * du2, p1 * dv1 + p2 * dv2, s1 * du1 + s2 * du2, s1 * dv1 + s2 * dv2, bias, max_probes)
+        r, g, b = r * tr, g * tg, b * tb
+    else:
+        r, g, b = r * np.float32(255), g * np.float32(255), b * np.float32(255)
+    if len(vertex_colors) > 0:
+        q = np.float32(1.0 / 255.0)
+        r *= q * (b0 * vertex_colors[i0, 0] + b1 * vertex_colors[i1, 0] + b2 * vertex_colors[i2, 0])
+        g *= q * (b0 * vertex_colors[i0, 1] + b1 * vertex_colors[i1, 1] + b2 * vertex_colors[i2, 1])
+        b *= q * (b0 * vertex_colors[i0, 2] + b1 * vertex_colors[i1, 2] + b2 * vertex_colors[i2, 2])
+    k = _brightness(ox + t[n] * dx, oy + t[n] * dy, oz + t[n] * dz, nx, ny, nz, lights, occlusion, grid, origin,
+                    inv_voxel)
+    rgb[n, 0] = min(r * k, np.float32(255))
+    rgb[n, 1] = min(g * k, np.float32(255))
+    rgb[n, 2] = min(b * k, np.float32(255))
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+def shade(rays, t, face, bary, right, down, scene, bias, max_probes, rgb, normal):
+    """Colours (N, 3) float32 0..255 and viewer-facing unit normals (N, 3) of ray hits.
+
+    `rays` (N, 6), `t` (N,), `face` (N,) uint32, `bary` (N, 2) as `SurfaceIndex.cast` returns them; `right`, `down` (3,)
+    world change of a ray's direction over one footprint; `scene` the tuple `PackedScene.arrays`.
+    """
+    count = len(t)
+    for chunk in prange((count + _CHUNK - 1) // _CHUNK):
+        for n in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, count)):
+            _shade_one(n, rays, t, face, bary, right, down, scene, bias, max_probes, rgb, normal)
+
+
+@njit(fastmath=True, cache=True)
+def _differs(a, b, rays, t, face, normal, rgb, face_material, contrast):
+    """Whether an edge worth supersampling lies between pixels a and b."""
+    fa, fb = face[a], face[b]
+    if fa == fb:
+        return False
+    step = max(abs(rgb[a, 0] - rgb[b, 0]), abs(rgb[a, 1] - rgb[b, 1]), abs(rgb[a, 2] - rgb[b, 2]))
+    if step < contrast:
+        return False
+    if fa == NO_HIT or fb == NO_HIT:
+        return True
+    if face_material[fa] != face_material[fb]:
+        return True
+    dot = normal[a, 0] * normal[b, 0] + normal[a, 1] * normal[b, 1] + normal[a, 2] * normal[b, 2]
+    if dot < np.float32(0.97):
+        return True
+    # Distance of b's point from a's tangent plane: a step in depth.
+    off = _ZERO
+    for c in range(3):
+        off += normal[a, c] * (t[b] * rays[b, 3 + c] - t[a] * rays[a, 3 + c])
+    if abs(off) > np.float32(0.01) * t[a]:
+        return True
+    return step > np.float32(8) * contrast
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+def edge_pixels(rays, t, face, normal, rgb, face_material, contrast, width, height, marked):
+    """Mark (H * W,) uint8 the pixels that differ from one of their eight neighbours in surface and colour."""
+    for i in prange(height):
+        for j in range(width):
+            n = i * width + j
+            hit = False
+            for di in range(-1, 2):
+                for dj in range(-1, 2):
+                    a, b = i + di, j + dj
+                    if not hit and 0 <= a < height and 0 <= b < width and (di != 0 or dj != 0):
+                        hit = _differs(n, a * width + b, rays, t, face, normal, rgb, face_material, contrast)
+            marked[n] = np.uint8(1) if hit else np.uint8(0)
+
+
+@njit(parallel=True, cache=True)
+def sample_rays(pixels, offsets, width, T, inv_fx, inv_fy, cx, cy, rays):
+    """Rays (P * K, 6) float32 through points `offsets` (K, 2) of the pixels (P,) flat indices, depth per unit t.
+
+    `T` (4, 4) float64 T_world_camera; offsets are (x, y) in 0..1 from the pixel's top left corner.
+    """
+    k = len(offsets)
+    for p in prange(len(pixels)):
+        i, j = pixels[p] // width, pixels[p] % width
+        for s in range(k):
+            x = (j + offsets[s, 0] - cx) * inv_fx
+            y = (i + offsets[s, 1] - cy) * inv_fy
+            n = p * k + s
+            for c in range(3):
+                rays[n, c] = T[c, 3]
+                rays[n, 3 + c] = T[c, 0] * x + T[c, 1] * y + T[c, 2]
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+def average_samples(pixels, samples, rgb):
+    """Write the mean of each pixel's K samples (P, K, 3) into rgb (H * W, 3)."""
+    k = samples.shape[1]
+    inv = _ONE / np.float32(k)
+    for p in prange(len(pixels)):
+        for c in range(3):
+            total = _ZERO
+            for s in range(k):
+                total += samples[p, s, c]
+            rgb[pixels[p], c] = total * inv
+
+
+@njit(parallel=True, cache=True)
+def plane_hits(rays, face, vertices, faces, t, bary):
+    """Exact t and barycentric coordinates of rays on the planes of the faces they are known to meet (float64)."""
+    for n in prange(len(face)):
+        f = face[n]
+        if f == NO_HIT:
+            t[n] = np.inf
+            bary[n, 0] = _ZERO
+            bary[n, 1] = _ZERO
+            continue
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        e1 = np.empty(3)
+        e2 = np.empty(3)
+        s = np.empty(3)
+        d = np.empty(3)
+        for k in range(3):
+            e1[k] = float(vertices[b, k]) - float(vertices[a, k])
+            e2[k] = float(vertices[c, k]) - float(vertices[a, k])
+            s[k] = float(rays[n, k]) - float(vertices[a, k])
+            d[k] = float(rays[n, 3 + k])
+        px, py, pz = d[1] * e2[2] - d[2] * e2[1], d[2] * e2[0] - d[0] * e2[2], d[0] * e2[1] - d[1] * e2[0]
+        det = e1[0] * px + e1[1] * py + e1[2] * pz
+        if abs(det) < 1e-18:
+            det = 1e-18
+        qx, qy, qz = s[1] * e1[2] - s[2] * e1[1], s[2] * e1[0] - s[0] * e1[2], s[0] * e1[1] - s[1] * e1[0]
+        u = (s[0] * px + s[1] * py + s[2] * pz) / det
+        v = (d[0] * qx + d[1] * qy + d[2] * qz) / det
+        t[n] = (e2[0] * qx + e2[1] * qy + e2[2] * qz) / det
+        bary[n, 0] = min(max(u, 0.0), 1.0)
+        bary[n, 1] = min(max(v, 0.0), 1.0 - bary[n, 0])
+
+
+@njit(parallel=True, cache=True)
+def holes(face, bary, face_material, cutoff, uv, mip_range, levels, texels, out):
+    """(N,) bool, whether a hit falls on a texel whose alpha is below its material's cutoff (0..255, < 0 = none)."""
+    for n in prange(len(face)):
+        out[n] = False
+        f = face[n]
+        if f == NO_HIT:
+            continue
+        m = face_material[f]
+        if cutoff[m] < 0 or mip_range[m, 1] <= mip_range[m, 0]:
+            continue
+        level = mip_range[m, 0]
+        offset, width, height = levels[level, 0], levels[level, 1], levels[level, 2]
+        b1, b2 = bary[n, 0], bary[n, 1]
+        b0 = 1 - b1 - b2
+        u = b0 * uv[f, 0, 0] + b1 * uv[f, 1, 0] + b2 * uv[f, 2, 0]
+        v = b0 * uv[f, 0, 1] + b1 * uv[f, 1, 1] + b2 * uv[f, 2, 1]
+        x = _wrap(np.int64(math.floor(u * width)), width)
+        y = _wrap(np.int64(math.floor(v * height)), height)
+        out[n] = texels[offset + y * width + x, 3] < cutoff[m]
+
+
+@njit(cache=True)
+def crease_normals(faces, starts, corners, merged, face_normal, face_area, cos_crease, out):
+    """Corner normals (F, 3, 3) int16 (unit = 32767): area-weighted over adjacent faces within the crease angle.
+
+    `merged` (F, 3) vertex ids after merging equal positions; `starts` (M + 1,), `corners`: the corners 3 f + c of every
+    merged vertex (CSR). A neighbour wound the other way counts with its normal turned.
+    """
+    for f in range(len(faces)):
+        for c in range(3):
+            v = merged[f, c]
+            begin, end = starts[v], starts[v + 1]
+            x, y, z = face_normal[f, 0] * face_area[f], face_normal[f, 1] * face_area[f], face_normal[f, 2] * face_area[f]
+            if end - begin <= 256:
+                for k in range(begin, end):
+                    g = corners[k] // 3
+                    if g == f:
+                        continue
+                    dot = (face_normal[f, 0] * face_normal[g, 0] + face_normal[f, 1] * face_normal[g, 1]
+                           + face_normal[f, 2] * face_normal[g, 2])
+                    if abs(dot) > cos_crease:
+                        w = face_area[g] if dot > 0 else -face_area[g]
+                        x, y, z = x + w * face_normal[g, 0], y + w * face_normal[g, 1], z + w * face_normal[g, 2]
+            norm = math.sqrt(x * x + y * y + z * z)
+            if norm > 0:
+                out[f, c, 0] = np.int16(round(32767 * x / norm))
+                out[f, c, 1] = np.int16(round(32767 * y / norm))
+                out[f, c, 2] = np.int16(round(32767 * z / norm))

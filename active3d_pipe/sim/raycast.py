@@ -1,0 +1,62 @@
+"""The default renderer: Open3D ray casting. No graphics driver, the same bytes on every run."""
+
+import numpy as np
+
+from active3d_pipe.sim.config import SensorSettings
+from active3d_pipe.sim.rendering import Hits, SurfaceRenderer
+from active3d_pipe.sim.scene import Scene
+from active3d_pipe.structures import Camera
+
+_MAX_LAYERS = 32  # alpha-masked surfaces that a ray may pass
+_STEP_BEYOND = 1e-4  # share of t by which a ray restarts behind a hole
+
+
+class RaycastSimulator(SurfaceRenderer):
+    """A `Simulator` on Open3D's RaycastingScene."""
+
+    def __init__(self, scene: Scene, camera: Camera, settings: SensorSettings, seed: int = 0) -> None:
+        super().__init__(scene, camera, settings, seed)
+        self._offsets = low_discrepancy_offsets(settings.edge_samples)
+
+    def _primary(self, T: np.ndarray) -> Hits:
+        return self._cast(self._rays(T, self._all_pixels, self._centres))
+
+    def _samples(self, T: np.ndarray, pixels: np.ndarray) -> tuple[Hits, int]:
+        return self._cast(self._rays(T, pixels, self._offsets)), len(self._offsets)
+
+    def _cast(self, rays: np.ndarray) -> Hits:
+        """First hits of rays that is not a hole."""
+        hits = Hits(rays, *self.surface.cast(rays))
+        if not self._packed.has_holes:
+            return hits
+        todo = np.flatnonzero(self._holes(hits))
+        for _ in range(_MAX_LAYERS):
+            if len(todo) == 0:
+                break
+            skipped = hits.t[todo] * (1 + _STEP_BEYOND) + 1e-5
+            onward = rays[todo].copy()
+            onward[:, :3] += skipped[:, None] * onward[:, 3:]
+            more = Hits(rays[todo], *self.surface.cast(onward))
+            hits.t[todo], hits.face[todo], hits.bary[todo] = more.t + skipped, more.face, more.bary
+            todo = todo[self._holes(more)]
+        return hits
+
+
+def low_discrepancy_offsets(count: int) -> np.ndarray:
+    """(count, 2) float64 points in the unit square: a rank-1 lattice, every row and column of count cells hit once.
+
+    The generator is the odd step that spreads the points best (largest smallest distance on the torus).
+    """
+    if count <= 0:
+        return np.zeros((0, 2))
+    i = np.arange(count)
+    best, widest = np.zeros((count, 2)), -1.0
+    for step in range(1, count + 1):
+        if np.gcd(step, count) != 1:
+            continue
+        points = np.stack([(i + 0.5) / count, ((i * step) % count + 0.5) / count], axis=-1)
+        delta = np.abs(points[:, None] - points[None])
+        distance = np.linalg.norm(np.minimum(delta, 1 - delta), axis=-1) + 2 * np.eye(count)
+        if distance.min() > widest:
+            best, widest = points, float(distance.min())
+    return best

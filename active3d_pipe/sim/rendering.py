@@ -1,0 +1,142 @@
+"""What all renderers share: shading, supersampled edges, the sensor, clearance. A backend adds visibility."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+from active3d_pipe.geometry.raycasting import SurfaceIndex
+from active3d_pipe.sim import kernels, noise, shading
+from active3d_pipe.sim.config import SensorSettings
+from active3d_pipe.sim.scene import Scene
+from active3d_pipe.structures import Camera, Frame, check_pose
+
+_CONTRAST = 3.0  # colour step, 0..255, below which an edge is not worth more samples
+_CLEARANCE_STEP_M = 0.005
+
+
+@dataclass(slots=True, eq=False)
+class Hits:
+    """First surfaces along N rays: `rays` (N, 6), `t` (N,), `face` (N,) uint32, `bary` (N, 2), see SurfaceIndex.cast."""
+
+    rays: np.ndarray
+    t: np.ndarray
+    face: np.ndarray
+    bary: np.ndarray
+
+
+class SurfaceRenderer(ABC):
+    """A `Simulator` over a triangle scene.
+
+    Colour: one sample at the pixel centre with the texture filtered over the pixel's footprint; pixels at an edge of
+    geometry or material are averaged over further samples instead. Depth: exact at the pixel centre.
+    """
+
+    def __init__(self, scene: Scene, camera: Camera, settings: SensorSettings, seed: int = 0) -> None:
+        self._scene, self._camera, self._settings, self._seed = scene, camera, settings, seed
+        self.surface = SurfaceIndex(scene.vertices, scene.faces)
+        self._packed = shading.pack(scene, self.surface)
+        self._centres = np.full((1, 2), 0.5)
+        self._all_pixels = np.arange(camera.width * camera.height)
+
+    @property
+    def scene(self) -> Scene:
+        """The scene."""
+        return self._scene
+
+    @property
+    def camera(self) -> Camera:
+        """Intrinsics of every frame."""
+        return self._camera
+
+    @property
+    def seed(self) -> int:
+        """Seed of the sensor's noise."""
+        return self._seed
+
+    @abstractmethod
+    def _primary(self, T: np.ndarray) -> Hits:
+        """Hits of the rays through all pixel centres, row by row."""
+
+    @abstractmethod
+    def _samples(self, T: np.ndarray, pixels: np.ndarray) -> tuple[Hits, int]:
+        """Hits of K rays through each of `pixels` (flat indices), pixel by pixel, and K."""
+
+    def render(self, T_world_camera: np.ndarray, *, step: int = 0, stamp_ns: int = 0) -> Frame:
+        """See `Simulator.render`."""
+        T = check_pose(T_world_camera, f"simulator, step {step}")
+        camera = self._camera
+        hits = self._primary(T)
+        rgb = self._colours(T, hits)
+        rgb8 = np.rint(rgb).astype(np.uint8).reshape(camera.height, camera.width, 3)
+        true_depth = np.where(np.isfinite(hits.t), hits.t, 0).reshape(camera.height, camera.width)
+        rng = noise.frame_generator(self._seed, step)
+        depth = noise.apply_depth_sensor(true_depth, camera, self._settings, rng)
+        return Frame(step, stamp_ns, camera, T, rgb8, depth)
+
+    def depth(self, T_world_camera: np.ndarray) -> np.ndarray:
+        """See `Simulator.depth`."""
+        camera = self._camera
+        t = self._primary(check_pose(T_world_camera, "simulator")).t
+        valid = np.isfinite(t) & (t >= camera.near) & (t <= camera.far)
+        return np.where(valid, t, 0).astype(np.float32).reshape(camera.height, camera.width)
+
+    def clearance(self, points: np.ndarray) -> np.ndarray:
+        """See `Simulator.clearance`."""
+        return self.surface.distance(np.asarray(points, dtype=np.float32).reshape(-1, 3))
+
+    def segment_clearance(self, a: np.ndarray, b: np.ndarray) -> float:
+        """See `Simulator.segment_clearance`; sampled every 5 mm."""
+        a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+        length = float(np.linalg.norm(b - a))
+        if length > 0 and bool(self.surface.occluded(a[None], b[None])[0]):
+            return 0.0
+        s = np.linspace(0, 1, int(np.ceil(length / _CLEARANCE_STEP_M)) + 1)[:, None]
+        return float(self.clearance(a + s * (b - a)).min())
+
+    def _colours(self, T: np.ndarray, hits: Hits) -> np.ndarray:
+        """(H * W, 3) float32 anti-aliased colours 0..255."""
+        camera = self._camera
+        rgb, normal = self._shade(T, hits, 1.0)
+        if self._settings.edge_samples == 0:
+            return rgb
+        marked = np.empty(len(rgb), np.uint8)
+        face_material = self._packed.arrays[2]
+        kernels.edge_pixels(
+            hits.rays, hits.t, hits.face, normal, rgb, face_material, np.float32(_CONTRAST), camera.width, camera.height,
+            marked,
+        )
+        pixels = np.flatnonzero(marked)
+        if len(pixels):
+            samples, count = self._samples(T, pixels)
+            colours, _ = self._shade(T, samples, 1 / np.sqrt(count))
+            kernels.average_samples(pixels, colours.reshape(len(pixels), count, 3), rgb)
+        return rgb
+
+    def _shade(self, T: np.ndarray, hits: Hits, footprint: float) -> tuple[np.ndarray, np.ndarray]:
+        """Colours and normals (N, 3) float32 of hits whose samples are `footprint` pixels wide."""
+        right = (T[:3, 0] * (footprint / self._camera.fx)).astype(np.float32)
+        down = (T[:3, 1] * (footprint / self._camera.fy)).astype(np.float32)
+        rgb = np.empty((len(hits.t), 3), np.float32)
+        normal = np.empty((len(hits.t), 3), np.float32)
+        kernels.shade(
+            hits.rays, hits.t, hits.face, hits.bary, right, down, self._packed.arrays,
+            np.float32(shading.TEXTURE_BIAS), shading.MAX_PROBES, rgb, normal,
+        )
+        return rgb, normal
+
+    def _rays(self, T: np.ndarray, pixels: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+        """(P * K, 6) float32 rays through points `offsets` (K, 2) of `pixels` (P,)."""
+        camera = self._camera
+        rays = np.empty((len(pixels) * len(offsets), 6), np.float32)
+        kernels.sample_rays(
+            pixels, offsets, camera.width, np.ascontiguousarray(T), 1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy, rays
+        )
+        return rays
+
+    def _holes(self, hits: Hits) -> np.ndarray:
+        """(N,) bool, hits on holes of alpha masks."""
+        a = self._packed.arrays
+        out = np.empty(len(hits.face), np.bool_)
+        kernels.holes(hits.face, hits.bary, a[2], self._packed.cutoff, a[3], a[7], a[8], a[9], out)
+        return out
