@@ -143,6 +143,11 @@ class MeshBuilder:
             p[None, :, :1] * ring[:, None, :], np.broadcast_to(p[None, :, 1:], (n + 1, len(p), 1))], axis=-1)
         self.grid(material, points)
 
+    def revolve_at(self, material: Material, position: Vector, profile: Sequence[tuple[float, float]]) -> None:
+        """`revolve` about a vertical axis through `position`."""
+        with self.placed(*(float(x) for x in position)):
+            self.revolve(material, profile)
+
     def tube(self, material: Material, path: Sequence[Vector], radius: float, *, segments: int = 8) -> None:
         """A round rod along a polyline (K, 3), capped by closing the end rings."""
         n = self.segments(segments, 5)
