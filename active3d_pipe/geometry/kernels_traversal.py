@@ -1,0 +1,145 @@
+"""Numba kernels of voxel traversal; `reference_traversal.py` is the slow, obvious twin.
+
+All kernels work in voxel units: a point is (world - grid.origin) / voxel_size, so voxel (i, j, k) is the cube
+[i, i+1) x [j, j+1) x [k, k+1). Ray parameters t stay in metres: a direction is a unit vector / voxel_size.
+Flat voxel ids are C order: (i * ny + j) * nz + k.
+"""
+
+import numpy as np
+from numba import njit
+
+# Stands for infinity: fastmath kernels must not meet a real one.
+FAR = np.float32(1e30)
+ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
+
+
+@njit(fastmath=True, cache=True)
+def entry_parameter(px, py, pz, dx, dy, dz, nx, ny, nz):
+    """Smallest t >= 0 at which the ray is inside the box, or -1 when it never is."""
+    t0, t1 = ZERO, FAR
+    for axis in range(3):
+        p = px if axis == 0 else (py if axis == 1 else pz)
+        d = dx if axis == 0 else (dy if axis == 1 else dz)
+        n = np.float32(nx if axis == 0 else (ny if axis == 1 else nz))
+        if abs(d) < np.float32(1e-12):
+            if p < ZERO or p >= n:
+                return np.float32(-1.0)
+            continue
+        a, b = -p / d, (n - p) / d
+        if a > b:
+            a, b = b, a
+        t0, t1 = max(t0, a), min(t1, b)
+    return t0 if t0 <= t1 else np.float32(-1.0)
+
+
+@njit(fastmath=True, cache=True)
+def walk_ray(opaque, px, py, pz, dx, dy, dz, t_end, nx, ny, nz, ids):
+    """Voxels that a ray crosses, in order, up to t_end or the first opaque one, which is included.
+
+    Amanatides and Woo, "A fast voxel traversal algorithm for ray tracing" (1987). `opaque` is flat uint8;
+    `ids` is an int32 buffer of at least nx + ny + nz + 3. Returns how many ids were written.
+    """
+    t = entry_parameter(px, py, pz, dx, dy, dz, nx, ny, nz)
+    if t < ZERO or t > t_end:
+        return 0
+    i = min(max(np.int32(np.floor(px + t * dx)), 0), nx - 1)
+    j = min(max(np.int32(np.floor(py + t * dy)), 0), ny - 1)
+    k = min(max(np.int32(np.floor(pz + t * dz)), 0), nz - 1)
+    si, sj, sk = (1 if dx > 0 else -1), (1 if dy > 0 else -1), (1 if dz > 0 else -1)
+    tiny = np.float32(1e-12)
+    ex = ONE / abs(dx) if abs(dx) > tiny else FAR
+    ey = ONE / abs(dy) if abs(dy) > tiny else FAR
+    ez = ONE / abs(dz) if abs(dz) > tiny else FAR
+    tx = (np.float32(i + (1 if si > 0 else 0)) - px) / dx if abs(dx) > tiny else FAR
+    ty = (np.float32(j + (1 if sj > 0 else 0)) - py) / dy if abs(dy) > tiny else FAR
+    tz = (np.float32(k + (1 if sk > 0 else 0)) - pz) / dz if abs(dz) > tiny else FAR
+    n = 0
+    while True:
+        v = (i * ny + j) * nz + k
+        ids[n] = v
+        n += 1
+        if opaque[v] != 0:
+            return n
+        if tx <= ty and tx <= tz:
+            if tx > t_end:
+                return n
+            i += si
+            if i < 0 or i >= nx:
+                return n
+            tx += ex
+        elif ty <= tz:
+            if ty > t_end:
+                return n
+            j += sj
+            if j < 0 or j >= ny:
+                return n
+            ty += ey
+        else:
+            if tz > t_end:
+                return n
+            k += sk
+            if k < 0 or k >= nz:
+                return n
+            tz += ez
+
+
+@njit(fastmath=True, cache=True)
+def mark_visible(opaque, origin, directions, t_end, shape, seen):
+    """Set seen[v] = 1 for every voxel that some ray crosses; directions (M, 3) unit / voxel_size, t_end m."""
+    nx, ny, nz = shape
+    ids = np.empty(nx + ny + nz + 3, np.int32)
+    for r in range(directions.shape[0]):
+        n = walk_ray(
+            opaque, origin[0], origin[1], origin[2], directions[r, 0], directions[r, 1], directions[r, 2],
+            t_end, nx, ny, nz, ids,
+        )
+        for m in range(n):
+            seen[ids[m]] = 1
+
+
+@njit(fastmath=True, cache=True)
+def carve_rays(clear, origin, directions, t_hit, t_max, shape, free, hit):
+    """Count, for every voxel, the rays that passed it and those that ended in it.
+
+    `clear` is an all-zero opaque array; t_hit (M,) m along each ray, <= 0 = no return: the ray says nothing.
+    Returns beyond t_max carve up to t_max and end nowhere. `free` and `hit` (flat int32) are added to.
+    """
+    nx, ny, nz = shape
+    ids = np.empty(nx + ny + nz + 3, np.int32)
+    for r in range(directions.shape[0]):
+        t = t_hit[r]
+        if t <= ZERO:
+            continue
+        dx, dy, dz = directions[r, 0], directions[r, 1], directions[r, 2]
+        end = np.int32(-1)
+        if t <= t_max:
+            i = np.int32(np.floor(origin[0] + t * dx))
+            j = np.int32(np.floor(origin[1] + t * dy))
+            k = np.int32(np.floor(origin[2] + t * dz))
+            if 0 <= i < nx and 0 <= j < ny and 0 <= k < nz:
+                end = (i * ny + j) * nz + k
+                hit[end] += 1
+        n = walk_ray(clear, origin[0], origin[1], origin[2], dx, dy, dz, min(t, t_max), nx, ny, nz, ids)
+        for m in range(n):
+            if ids[m] != end:
+                free[ids[m]] += 1
+
+
+@njit(fastmath=True, cache=True)
+def first_hits(opaque, origin, directions, t_end, shape, out_t):
+    """Distance (m) at which each ray enters the first opaque voxel, 0 when it meets none before t_end."""
+    nx, ny, nz = shape
+    ids = np.empty(nx + ny + nz + 3, np.int32)
+    for r in range(directions.shape[0]):
+        dx, dy, dz = directions[r, 0], directions[r, 1], directions[r, 2]
+        n = walk_ray(opaque, origin[0], origin[1], origin[2], dx, dy, dz, t_end, nx, ny, nz, ids)
+        out_t[r] = ZERO
+        if n == 0 or opaque[ids[n - 1]] == 0:
+            continue
+        v = ids[n - 1]
+        i, j, k = v // (ny * nz), (v // nz) % ny, v % nz
+        # Entry into that voxel alone: the box test, shifted to its corner.
+        t = entry_parameter(
+            origin[0] - np.float32(i), origin[1] - np.float32(j), origin[2] - np.float32(k), dx, dy, dz, 1, 1, 1
+        )
+        out_t[r] = max(t, np.float32(1e-6))

@@ -1,0 +1,159 @@
+"""Expected information gain of looking at voxels, shared by keyframe choice and planning.
+
+The observation model, in one place:
+
+- A voxel is *surface* when depth rays ended in it and it is probably solid; *seen free* when enough rays passed it
+  and it is no surface (whatever the field believes: phantom structure draws no attention); everything else is
+  *open*: it may still turn out either way.
+- A look at an open voxel settles it: each branch's entropy falls to a residual. The fraction of this that is still
+  to be had is its novelty, 1 for a voxel that no ray reached and 0 once `settled_rays` did.
+- A look at a surface voxel improves it as far as the look is better than the best so far (closer, more frontal),
+  up to `enough_quality`; beyond that nothing is gained, so close-ups are not chased.
+- Seen free space tells nothing, whatever its U and H say.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from active3d_pipe.information.config import InformationSettings
+
+FREE, OPEN, SURFACE = 0, 1, 2
+# A voxel whose rays end in it at least this often is no free space: thin structure fills part of a voxel only.
+THIN_HIT_SHARE = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class GainTerms:
+    """What one view is expected to bring.
+
+    Attributes:
+        reward: R(c) of eq. nbv_reward over the open voxels, plus the surface term.
+        surface: the part of `reward` that comes from poorly seen surface.
+        gain_imp, gain_exp: expected entropy reduction of each branch, bits (terms of eq. nbv_eig).
+        num_visible: visible voxels. num_open: those of them that are not settled.
+    """
+
+    reward: float
+    surface: float
+    gain_imp: float
+    gain_exp: float
+    num_visible: int
+    num_open: int
+
+    @property
+    def gain(self) -> float:
+        """Delta I_hybrid = Delta H[F_theta] + Delta H[G_k], bits."""
+        return self.gain_imp + self.gain_exp
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InformationVolumes:
+    """Per-voxel quantities that make up the gain of any view, each [X, Y, Z].
+
+    Attributes:
+        kind: uint8, FREE, OPEN or SURFACE.
+        value: float32, w(v) (1 - O(v)) times novelty; 0 for surface and seen free space.
+        surface_value: float32, what improving the surface from quality 0 to `enough_quality` is worth.
+        quality: float32, best observation so far.
+        gain_imp, gain_exp: float32, expected entropy reduction of a look, bits.
+    """
+
+    kind: np.ndarray
+    value: np.ndarray
+    surface_value: np.ndarray
+    quality: np.ndarray
+    gain_imp: np.ndarray
+    gain_exp: np.ndarray
+
+
+def classify(arrays: Mapping[str, np.ndarray], settings: InformationSettings) -> np.ndarray:
+    """uint8 kind of every voxel from occupancy and ray evidence (see the module's first lines)."""
+    free, hit, occupancy = arrays["free_evidence"], arrays["hit_evidence"], arrays["occupancy"]
+    rays = free + hit
+    surface = (hit > 0) & ((occupancy > 0.5) | (hit >= np.maximum(2, THIN_HIT_SHARE * rays)))
+    seen_free = ~surface & (free >= settings.settled_rays)
+    return np.where(surface, SURFACE, np.where(seen_free, FREE, OPEN)).astype(np.uint8)
+
+
+def normalised_uncertainty(u_final: np.ndarray, observed: np.ndarray) -> np.ndarray:
+    """U(v) in units of its typical value where nothing was observed, clipped to [0, 2], float32.
+
+    The scale of the fused uncertainty follows from the regression that fits it and drifts over a run; weights and
+    thresholds of the planner need one that stays.
+    """
+    u = np.maximum(u_final, 0)
+    unseen = u[~observed]
+    level = float(np.median(unseen)) if unseen.size else float(u.max(initial=0.0))
+    if level <= 1e-9:
+        return np.zeros_like(u, dtype=np.float32)
+    return np.clip(u / np.float32(level), 0, 2).astype(np.float32)
+
+
+def hybrid_weight(u: np.ndarray, entropy: np.ndarray, settings: InformationSettings) -> np.ndarray:
+    """w(v|c) = alpha U(v) + beta H_hybrid(v) (eq. nbv_weight)."""
+    return np.float32(settings.alpha) * u + np.float32(settings.beta) * entropy
+
+
+def view_quality(
+    cos_incidence: np.ndarray | float, distance_m: np.ndarray | float, settings: InformationSettings
+) -> np.ndarray:
+    """Quality of one look at a surface: |cos| of the incidence angle times min(1, quality_range / distance)."""
+    near = np.minimum(1, settings.quality_range_m / np.maximum(distance_m, 1e-6))
+    return np.clip(np.abs(cos_incidence), 0, 1) * near
+
+
+def information_volumes(
+    arrays: Mapping[str, np.ndarray], settings: InformationSettings, credit: np.ndarray | None = None
+) -> InformationVolumes:
+    """Gain quantities of every voxel, from the arrays of an `UncertaintyVolume`.
+
+    Args:
+        arrays: the volumes named in `structures.uncertainty_volume.VOLUMES`, float32 [X, Y, Z].
+        credit: [X, Y, Z] factor in [0, 1] on everything that is expected of a voxel, e.g. lowered where earlier
+            looks brought nothing; None = 1.
+    """
+    kind = classify(arrays, settings)
+    rays = arrays["free_evidence"] + arrays["hit_evidence"]
+    u = normalised_uncertainty(arrays["u_final"], rays > 0)
+    weight = hybrid_weight(u, arrays["entropy"], settings)
+    novelty = np.where(kind == OPEN, np.maximum(0, 1 - rays / np.float32(settings.settled_rays)), 0)
+    # What a better look still brings to a surface, as a fraction of the whole improvement.
+    rest = np.maximum(0, 1 - arrays["view_quality"] / np.float32(settings.enough_quality))
+    rest = np.where(kind == SURFACE, rest, 0)
+    trust = np.float32(1) if credit is None else credit.astype(np.float32)
+    value = weight * (1 - arrays["occupancy"]) * novelty * trust
+    surface_value = (settings.alpha * u + settings.beta) * (kind == SURFACE) * settings.surface_weight * trust
+    fraction = (novelty + rest) * trust
+
+    def reduction(entropy: np.ndarray) -> np.ndarray:
+        return (np.maximum(0, entropy - settings.residual_bits) * fraction).astype(np.float32)
+
+    return InformationVolumes(
+        kind, value.astype(np.float32), surface_value.astype(np.float32), arrays["view_quality"],
+        reduction(arrays["entropy_imp"]), reduction(arrays["entropy_exp"]),
+    )
+
+
+def visible_information(
+    arrays: Mapping[str, np.ndarray], visible: np.ndarray, settings: InformationSettings | None = None
+) -> GainTerms:
+    """Expected gain of a view that sees the voxels `visible` (flat ids, each once).
+
+    Surface counts as if it were then seen well enough; a caller that knows the pose scores more finely
+    (`planning.reward`).
+    """
+    settings = settings or InformationSettings()
+    volumes = information_volumes(arrays, settings)
+    kind = volumes.kind.ravel()[visible]
+    missing = np.maximum(0, 1 - volumes.quality.ravel()[visible] / settings.enough_quality)
+    surface = float((volumes.surface_value.ravel()[visible] * missing).sum(dtype=np.float64))
+    return GainTerms(
+        reward=float(volumes.value.ravel()[visible].sum(dtype=np.float64)) + surface,
+        surface=surface,
+        gain_imp=float(volumes.gain_imp.ravel()[visible].sum(dtype=np.float64)),
+        gain_exp=float(volumes.gain_exp.ravel()[visible].sum(dtype=np.float64)),
+        num_visible=len(visible),
+        num_open=int((kind == OPEN).sum()),
+    )

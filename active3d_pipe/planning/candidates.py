@@ -1,0 +1,95 @@
+"""Candidate views: positions over all reachable free space, coarse to fine, times view directions."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from active3d_pipe.geometry import se3
+from active3d_pipe.planning.config import PlanningSettings
+from active3d_pipe.planning.free_space import FreeSpace
+from active3d_pipe.structures.camera import Camera
+
+# Rays of the sphere: rows of elevation x columns of azimuth, 5 degrees apart.
+NUM_AZIMUTHS, NUM_ELEVATIONS = 72, 36
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Directions:
+    """A sphere of rays and the views that are made of them.
+
+    Attributes:
+        rays: (M, 3) float32 unit directions, world. solid_angles: (M,) float32, sr.
+        rotations: (V, 3, 3) R_world_camera of the views. yaws, pitches: (V,) rad.
+        members: (V, M) float32, 1 where a ray lies in the image of a view.
+    """
+
+    rays: np.ndarray
+    solid_angles: np.ndarray
+    rotations: np.ndarray
+    yaws: np.ndarray
+    pitches: np.ndarray
+    members: np.ndarray
+
+
+def view_directions(camera: Camera, settings: PlanningSettings) -> Directions:
+    """Level views: `num_yaws` times `pitches_deg`, on a sphere of rays."""
+    azimuth = (np.arange(NUM_AZIMUTHS) + 0.5) * (2 * math.pi / NUM_AZIMUTHS) - math.pi
+    edges = np.linspace(-math.pi / 2, math.pi / 2, NUM_ELEVATIONS + 1)
+    elevation = 0.5 * (edges[1:] + edges[:-1])
+    band = (np.sin(edges[1:]) - np.sin(edges[:-1])) * (2 * math.pi / NUM_AZIMUTHS)
+    el, az = (a.ravel() for a in np.meshgrid(elevation, azimuth, indexing="ij"))
+    rays = np.stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)], axis=-1)
+    yaw_steps = np.arange(settings.num_yaws) * (2 * math.pi / settings.num_yaws) - math.pi
+    yaws, pitches = (a.ravel() for a in np.meshgrid(yaw_steps, np.radians(settings.pitches_deg), indexing="ij"))
+    rotations = np.stack([
+        se3.pose_from_yaw_pitch(np.zeros(3), y, p)[:3, :3] for y, p in zip(yaws, pitches, strict=True)
+    ])
+    local = np.einsum("vji,mj->vmi", rotations, rays)
+    z = np.maximum(local[..., 2], 1e-9)
+    u, v = camera.fx * local[..., 0] / z + camera.cx, camera.fy * local[..., 1] / z + camera.cy
+    members = (local[..., 2] > 1e-6) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    return Directions(
+        rays.astype(np.float32), np.repeat(band, NUM_AZIMUTHS).astype(np.float32), rotations, yaws, pitches,
+        members.astype(np.float32),
+    )
+
+
+def coarse_positions(space: FreeSpace, settings: PlanningSettings) -> np.ndarray:
+    """(P, 3) int64 voxels: in every block of reachable space the voxel with the most clearance.
+
+    Blocks have the coarse spacing, or the smallest multiple of it at which there are at most `max_positions`.
+    """
+    spacing = settings.coarse_spacing_m
+    ijk = np.argwhere(space.reachable)
+    while True:
+        chosen = _thin(ijk, space, spacing)
+        if len(chosen) <= settings.max_positions:
+            return chosen
+        spacing *= 1.2
+
+
+def fine_positions(space: FreeSpace, around: np.ndarray, settings: PlanningSettings) -> np.ndarray:
+    """(P, 3) int64 reachable voxels within one coarse spacing of the voxels `around` (K, 3), finely spaced."""
+    if len(around) == 0:
+        return np.zeros((0, 3), np.int64)
+    reach = max(1, round(settings.coarse_spacing_m / space.grid.voxel_size))
+    near = np.zeros(space.grid.shape, bool)
+    for v in around:
+        low = np.maximum(v - reach, 0)
+        near[tuple(slice(a, b) for a, b in zip(low, v + reach + 1, strict=True))] = True
+    return _thin(np.argwhere(near & space.reachable), space, settings.fine_spacing_m)
+
+
+def _thin(ijk: np.ndarray, space: FreeSpace, spacing_m: float) -> np.ndarray:
+    """One voxel of every cubic block: most clearance first, then nearest to the block's middle, then lowest id."""
+    if len(ijk) == 0:
+        return ijk
+    block = max(1, round(spacing_m / space.grid.voxel_size))
+    cell = ijk // block
+    shape = np.asarray(space.grid.shape) // block + 1
+    key = (cell[:, 0] * shape[1] + cell[:, 1]) * shape[2] + cell[:, 2]
+    off_centre = np.abs(ijk - (cell * block + (block - 1) / 2)).sum(axis=1)
+    order = np.lexsort((off_centre, -space.risk.clearance_m[tuple(ijk.T)], key))
+    first = np.unique(key[order], return_index=True)[1]
+    return ijk[order[first]]

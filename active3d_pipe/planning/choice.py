@@ -1,0 +1,228 @@
+"""Scoring all candidates and choosing among them: gain against the steps it costs."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from active3d_pipe.information.gain import GainTerms
+from active3d_pipe.planning.candidates import Directions, coarse_positions, fine_positions
+from active3d_pipe.planning.config import PlanningSettings
+from active3d_pipe.planning.free_space import FreeSpace
+from active3d_pipe.planning.reward import RewardField, exact_terms, sphere_rewards
+from active3d_pipe.structures.camera import Camera
+from active3d_pipe.structures.decision import Decision, ScoredCandidate
+from active3d_pipe.structures.motion import MotionSettings
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pool:
+    """The candidates that were scored exactly, best first.
+
+    Attributes:
+        poses: (C, 4, 4). voxels: (C, 3) int64 voxel of each position.
+        terms: exact gain of each. travel_m: (C,) geodesic cost. utility: (C,).
+        committed: (C,) bool, the goal of the decision before.
+        num_candidates: how many views were scored at all.
+        positions: (P, 3) int64, all positions scored. best_rewards: (P,) float32 reward of the best view of each.
+    """
+
+    poses: np.ndarray
+    voxels: np.ndarray
+    terms: list[GainTerms]
+    travel_m: np.ndarray
+    utility: np.ndarray
+    committed: np.ndarray
+    num_candidates: int
+    positions: np.ndarray
+    best_rewards: np.ndarray
+
+    def ranking(self, count: int, reachable: dict[int, bool]) -> tuple[ScoredCandidate, ...]:
+        """The best `count` as they are reported; `reachable` says which were tried, and how it went."""
+        return tuple(
+            ScoredCandidate(
+                self.poses[i], t.reward, t.gain_imp, t.gain_exp, t.num_visible, float(self.travel_m[i]),
+                float(self.utility[i]), reachable.get(i),
+            )
+            for i, t in enumerate(self.terms[:count])
+        )
+
+
+def view_cost_steps(
+    travel_m: np.ndarray, R: np.ndarray, rotations: np.ndarray, motion: MotionSettings
+) -> np.ndarray:
+    """Steps until a view is reached: the longer of walking and turning, which go on at the same time. (C,)."""
+    trace = np.einsum("ij,vij->v", R, rotations)
+    angle = np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+    return np.maximum(travel_m / motion.max_step_m, angle / motion.max_turn_deg)
+
+
+def positions_world(space: FreeSpace, voxels: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray:
+    """(P, 3) world positions of voxels; the agent's own voxel stands for where it is, the ground keeps its height."""
+    out = space.grid.centre_of(voxels)
+    out[(voxels == space.start).all(axis=-1)] = T_world_camera[:3, 3]
+    if space.planar:
+        out[:, 2] = T_world_camera[2, 3]
+    return out
+
+
+def score(
+    space: FreeSpace,
+    field: RewardField,
+    T_world_camera: np.ndarray,
+    camera: Camera,
+    directions: Directions,
+    motion: MotionSettings,
+    settings: PlanningSettings,
+    previous: Decision | None,
+) -> Pool:
+    """Score every view of the reachable space, coarse to fine, and the best ones exactly."""
+    R = T_world_camera[:3, :3]
+    num_views = len(directions.rotations)
+
+    def utilities(voxels: np.ndarray, rewards: np.ndarray) -> np.ndarray:
+        travel = np.repeat(space.cost[tuple(voxels.T)], num_views)
+        rotations = np.tile(directions.rotations, (len(voxels), 1, 1))
+        steps = view_cost_steps(travel, R, rotations, motion).reshape(rewards.shape)
+        return rewards / (steps + settings.view_steps)
+
+    # The place where the agent stands is always a candidate: turning is the cheapest motion.
+    voxels = np.unique(np.concatenate([space.start[None], coarse_positions(space, settings)]), axis=0)
+    rewards = sphere_rewards(field, positions_world(space, voxels, T_world_camera), directions)
+    utility = utilities(voxels, rewards)
+    top = np.argsort(-utility.max(axis=1), kind="stable")[: settings.refine_top]
+    fine = fine_positions(space, voxels[top], settings)
+    fine = fine[~(fine[:, None] == voxels[None]).all(axis=-1).any(axis=1)]
+    if len(fine):
+        fine_rewards = sphere_rewards(field, positions_world(space, fine, T_world_camera), directions)
+        voxels, rewards = np.concatenate([voxels, fine]), np.concatenate([rewards, fine_rewards])
+        utility = np.concatenate([utility, utilities(fine, fine_rewards)])
+    chosen = _shortlist(voxels, rewards, utility, directions, settings)
+    poses = np.stack([np.eye(4)] * len(chosen)) if chosen else np.zeros((0, 4, 4))
+    at = np.array([p for p, _ in chosen], dtype=np.int64)
+    if chosen:
+        poses[:, :3, :3] = directions.rotations[[v for _, v in chosen]]
+        poses[:, :3, 3] = positions_world(space, voxels[at], T_world_camera)
+    goal_voxels = voxels[at]
+    committed = np.zeros(len(chosen), bool)
+    old = _previous_goal(previous, space)
+    if old is not None:
+        poses = np.concatenate([poses, old[0][None]])
+        goal_voxels = np.concatenate([goal_voxels, old[1][None]])
+        committed = np.append(committed, True)
+    terms = exact_terms(field, poses, camera)
+    travel = space.cost[tuple(goal_voxels.T)].astype(np.float64)
+    reward = np.array([t.reward for t in terms])
+    final = reward / (view_cost_steps(travel, R, poses[:, :3, :3], motion) + settings.view_steps)
+    final = np.where(committed, final * settings.commitment, final)
+    order = np.argsort(-final, kind="stable")
+    return Pool(
+        poses[order], goal_voxels[order], [terms[i] for i in order], travel[order], final[order], committed[order],
+        rewards.size, voxels, rewards.max(axis=1),
+    )
+
+
+def _shortlist(
+    voxels: np.ndarray, rewards: np.ndarray, utility: np.ndarray, directions: Directions, settings: PlanningSettings
+) -> list[tuple[int, int]]:
+    """(position, view) pairs worth an exact look: most by utility, some by reward alone, spread out.
+
+    Views that nearly repeat a better one (closer than the coarse spacing is fine and 40 degrees) are left out, so
+    that the list holds alternatives. Those by reward alone decide whether anything is left to see.
+    """
+    out: list[tuple[int, int]] = []
+    cos_near = math.cos(math.radians(40))
+    for ranking, count in ((rewards, settings.exact_top // 4), (utility, settings.exact_top)):
+        flat = np.argpartition(-ranking, min(ranking.size - 1, 12 * settings.exact_top), axis=None)
+        flat = flat[: 12 * settings.exact_top]
+        flat = flat[np.argsort(-ranking.ravel()[flat], kind="stable")]
+        for f in flat:
+            if len(out) >= count:
+                break
+            p, v = divmod(int(f), rewards.shape[1])
+            near = any(
+                np.abs(voxels[p] - voxels[q]).max() <= 2
+                and directions.rotations[v][:, 2] @ directions.rotations[w][:, 2] > cos_near
+                for q, w in out
+            )
+            if not near:
+                out.append((p, v))
+    return out
+
+
+def _previous_goal(previous: Decision | None, space: FreeSpace) -> tuple[np.ndarray, np.ndarray] | None:
+    """Goal pose and voxel of the decision before, while it is still ahead and reachable."""
+    if previous is None or previous.chosen < 0 or not previous.terms.get("goal_ahead", False):
+        return None
+    T = previous.ranking[previous.chosen].T_world_camera
+    voxel = space.grid.index_of(T[:3, 3])
+    if not space.grid.contains_index(voxel) or not space.reachable[tuple(voxel)]:
+        return None
+    if space.planar and voxel[2] != space.start[2]:
+        return None
+    return np.asarray(T, dtype=np.float64), voxel
+
+
+def reward_density(pool: Pool, space: FreeSpace) -> np.ndarray:
+    """R(x) of eq. risk_path in [0, 1], float32 [X, Y, Z]: the best view near x relative to the best anywhere.
+
+    Spread from the scored positions with a Gaussian of half a metre; 0 far away from all of them.
+    """
+    total, weight = np.zeros(space.grid.shape, np.float32), np.zeros(space.grid.shape, np.float32)
+    index = tuple(pool.positions.T)
+    total[index], weight[index] = pool.best_rewards, 1
+    sigma = 0.35 / space.grid.voxel_size
+    total, weight = (gaussian_filter(a, sigma, mode="constant", truncate=2.0) for a in (total, weight))
+    out = np.where(weight > 1e-6, total / np.maximum(weight, 1e-6), 0)
+    return (out / max(float(out.max()), 1e-9)).astype(np.float32)
+
+
+def looks_along(
+    points: np.ndarray,
+    R_start: np.ndarray,
+    T_goal: np.ndarray,
+    field: RewardField,
+    directions: Directions,
+    motion: MotionSettings,
+    spacing_m: float,
+) -> list[tuple[float, np.ndarray]]:
+    """Which way to look along a path (M, 3): (arc length, rotation), the goal's last.
+
+    The integral of the reward along the path (eq. risk_path) for the looking directions: dynamic programming over
+    the view directions at waypoints, where consecutive directions lie within what the steps between them can turn.
+    """
+    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    arc = np.concatenate([[0], np.cumsum(lengths)])
+    goal = (float(arc[-1]), T_goal[:3, :3])
+    n = int(arc[-1] / spacing_m)
+    if n < 1:
+        return [goal]
+    s = arc[-1] * np.arange(1, n + 1) / (n + 1)
+    waypoints = np.stack([np.interp(s, arc, points[:, i]) for i in range(3)], axis=-1)
+    rewards = sphere_rewards(field, waypoints, directions).astype(np.float64)
+    turn = np.radians(motion.max_turn_deg) * max(1.0, np.floor(arc[-1] / (n + 1) / motion.max_step_m))
+    R = directions.rotations
+    angle = np.arccos(np.clip((np.einsum("aij,bij->ab", R, R) - 1) / 2, -1, 1))
+    from_start = np.arccos(np.clip((np.einsum("ij,bij->b", R_start, R) - 1) / 2, -1, 1))
+    to_goal = np.arccos(np.clip((np.einsum("ij,bij->b", T_goal[:3, :3], R) - 1) / 2, -1, 1))
+    # Turning farther than the steps allow costs steps on the spot: forbidden unless nothing else is possible.
+    penalty = 1e3 * (1 + rewards.max())
+
+    def over(a: np.ndarray) -> np.ndarray:
+        return penalty * np.maximum(0, a - turn - 1e-6)
+
+    value = rewards[0] - over(from_start)
+    back = []
+    for w in range(1, n):
+        reach = value[:, None] - over(angle)
+        back.append(reach.argmax(axis=0))
+        value = reach.max(axis=0) + rewards[w]
+    v = int((value - over(to_goal)).argmax())
+    chosen = [v]
+    for pointer in reversed(back):
+        v = int(pointer[v])
+        chosen.append(v)
+    views = [(float(a), R[v]) for a, v in zip(s, reversed(chosen), strict=True)]
+    return [*views, goal]
+

@@ -1,0 +1,261 @@
+"""The decision of a round: next best view, path, or stop, with reasons.
+
+`decide` is the planner on one page: free space and risk field, reward field, candidates, choice, path. It sees the
+uncertainty volume and the poses walked so far, never the scene.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from active3d_pipe.errors import InputError
+from active3d_pipe.geometry.voxel_traversal import visible_voxels
+from active3d_pipe.planning.candidates import view_directions
+from active3d_pipe.planning.choice import Pool, looks_along, reward_density, score, view_cost_steps
+from active3d_pipe.planning.config import PlanningSettings
+from active3d_pipe.planning.free_space import FreeSpace, build_free_space
+from active3d_pipe.planning.path import look_around, step_path
+from active3d_pipe.planning.reward import RewardField, build_reward_field, exact_terms
+from active3d_pipe.planning.rrt_star import PlannedPath, plan_path
+from active3d_pipe.structures.camera import Camera
+from active3d_pipe.structures.decision import Decision, Reason
+from active3d_pipe.structures.frame import check_pose
+from active3d_pipe.structures.motion import MotionSettings
+from active3d_pipe.structures.uncertainty_volume import UncertaintyVolume
+
+# Views that are appended to a short path at most.
+LONGEST_CHAIN = 4
+
+
+def decide(
+    volume: UncertaintyVolume,
+    T_world_camera: np.ndarray,
+    walked_poses: np.ndarray,
+    camera: Camera,
+    motion: MotionSettings,
+    settings: PlanningSettings,
+    rng: np.random.Generator,
+    *,
+    previous: Decision | None = None,
+) -> Decision:
+    """Choose the next best view (eq. nbv_eig) and the path to it (eq. risk_path), or stop.
+
+    Args:
+        volume: what is known, on the grid, after the newest round.
+        T_world_camera: (4, 4) current pose.
+        walked_poses: (N, 4, 4) every pose captured so far, oldest first.
+        camera: its field of view and range; the resolution does not matter.
+        rng: for RRT*; same generator state, same decision.
+        previous: the decision before this one, for commitment to its goal and for the fallbacks.
+
+    Returns:
+        A decision with at most `max_steps_per_round` poses. It stops when no reachable view has an expected
+        reward above `stop_reward`, or when the agent cannot move and turning and going back did not help.
+
+    Raises:
+        InputError: the current pose is no rigid transform or lies outside the grid.
+    """
+    T = check_pose(T_world_camera, "current pose")
+    grid = volume.grid
+    if not grid.contains_index(grid.index_of(T[:3, 3])):
+        raise InputError(
+            f"current position {T[:3, 3].round(2).tolist()} lies outside the volume {grid.low.round(2).tolist()} .. "
+            f"{grid.high.round(2).tolist()}; enlarge the bounds"
+        )
+    walked = np.concatenate([np.asarray(walked_poses, dtype=np.float64).reshape(-1, 4, 4), T[None]])
+    field = build_reward_field(volume, walked, camera, settings)
+    directions = view_directions(camera, settings)
+    best = 0.0
+    for relaxed in (False, True):
+        space = build_free_space(volume, T, walked[:, :3, 3], motion, settings, relaxed=relaxed)
+        pool = score(space, field, T, camera, directions, motion, settings, previous)
+        best = max((t.reward for t in pool.terms), default=0.0)
+        if best >= settings.stop_reward:
+            reason = Reason.RELAXED if relaxed else Reason.BEST_GAIN
+            decision = _go(volume.round, space, pool, field, T, camera, motion, settings, rng, reason)
+            if decision is not None:
+                return decision
+    terms = {**_space_terms(space), "best_reward": best, "stop_reward": settings.stop_reward}
+    if _movable(space):
+        return Decision(volume.round, Reason.STOP_GAIN, True, np.zeros((0, 4, 4)), pool.ranking(settings.num_ranked, {}),
+                        -1, terms)
+    return _unstick(volume.round, space, T, walked, motion, settings, previous, terms)
+
+
+def bootstrap_decision(T_start: np.ndarray, motion: MotionSettings, settings: PlanningSettings) -> Decision:
+    """The first decision of a run (round -1, executed in round 0): look around from the start pose.
+
+    The start pose itself is the first pose of the path: nothing has been captured yet.
+    """
+    T = check_pose(T_start, "start pose")
+    turn = look_around(T, settings.bootstrap_turn_deg, settings.bootstrap_pitch_deg, motion)
+    path = np.concatenate([T[None], turn])
+    return Decision(-1, Reason.START, False, path, terms={"path_steps": len(path), "path_length_m": 0.0})
+
+
+def _go(
+    round: int,
+    space: FreeSpace,
+    pool: Pool,
+    field: RewardField,
+    T: np.ndarray,
+    camera: Camera,
+    motion: MotionSettings,
+    settings: PlanningSettings,
+    rng: np.random.Generator,
+    reason: Reason,
+) -> Decision | None:
+    """Walk to the best candidate that can be walked to; None when there is none."""
+    density = reward_density(pool, space)
+    tried: dict[int, bool] = {}
+    for index in range(len(pool.terms)):
+        if pool.terms[index].reward < settings.stop_reward:
+            continue
+        path = plan_path(space, T[:3, 3], pool.voxels[index], density, settings, rng)
+        poses = _poses(path, T, pool.poses[index], field, camera, motion, settings, None)
+        tried[index] = len(poses) > 0
+        if len(poses):
+            break
+        if len(tried) >= settings.num_ranked:
+            return None
+    else:
+        return None
+    goal_ahead = len(poses) > settings.max_steps_per_round
+    chained = 0
+    if len(poses) < settings.min_steps_per_round:
+        poses, chained = _chain(poses, index, space, pool, field, camera, motion, settings, rng, density)
+    chosen = pool.terms[index]
+    ranking = pool.ranking(max(settings.num_ranked, index + 1), tried)
+    terms: dict[str, Any] = {
+        **_space_terms(space),
+        "reward": chosen.reward,
+        "reward_surface": chosen.surface,
+        "gain_imp": chosen.gain_imp,
+        "gain_exp": chosen.gain_exp,
+        "gain": chosen.gain,
+        "num_visible": chosen.num_visible,
+        "num_open": chosen.num_open,
+        "utility": float(pool.utility[index]),
+        "travel_m": float(pool.travel_m[index]),
+        "best_reward": max(t.reward for t in pool.terms),
+        "stop_reward": settings.stop_reward,
+        "num_candidates": pool.num_candidates,
+        "num_positions": len(pool.positions),
+        "path_length_m": path.length_m,
+        "path_cost": path.cost,
+        "path_cost_grid": path.grid_cost,
+        "path_steps": min(len(poses), settings.max_steps_per_round),
+        "max_risk": path.max_risk,
+        "min_clearance_m": path.min_clearance_m,
+        "goal_ahead": goal_ahead,
+        "committed": bool(pool.committed[index]),
+        "chained_views": chained,
+    }
+    if reason is Reason.BEST_GAIN and len(tried) > 1:
+        reason = Reason.FALLBACK
+    return Decision(round, reason, False, poses[: settings.max_steps_per_round], ranking, index, terms)
+
+
+def _poses(
+    path: PlannedPath,
+    T: np.ndarray,
+    T_goal: np.ndarray,
+    field: RewardField,
+    camera: Camera,
+    motion: MotionSettings,
+    settings: PlanningSettings,
+    max_steps: int | None,
+) -> np.ndarray:
+    """Step poses along a path, looking where the reward lies on the way."""
+    directions = view_directions(camera, settings)
+    looks = looks_along(path.points, T[:3, :3], T_goal, field, directions, motion, settings.coarse_spacing_m)
+    return step_path(T, path.points, looks, motion, max_steps)
+
+
+def _chain(
+    poses: np.ndarray,
+    index: int,
+    space: FreeSpace,
+    pool: Pool,
+    field: RewardField,
+    camera: Camera,
+    motion: MotionSettings,
+    settings: PlanningSettings,
+    rng: np.random.Generator,
+    density: np.ndarray,
+) -> tuple[np.ndarray, int]:
+    """Continue a short path to the views that are best after the ones before it; (poses, number of views added).
+
+    A round costs mapping and planning, however short its path. What the views so far will have seen counts no more.
+    """
+    open_views = [i for i in range(len(pool.terms)) if i != index]
+    added = 0
+    opaque = field.opaque.reshape(field.grid.shape)
+    while len(poses) < settings.min_steps_per_round and open_views and added < LONGEST_CHAIN:
+        seen = visible_voxels(opaque, field.grid, pool.poses[index], camera, max_range_m=field.max_range_m)
+        field = field.without(seen)
+        here = space.moved_to(pool.voxels[index], settings, settings.max_steps_per_round * motion.max_step_m)
+        travel = here.cost[tuple(pool.voxels[open_views].T)]
+        near = [i for i, c in zip(open_views, travel, strict=True) if c < settings.max_steps_per_round * motion.max_step_m]
+        if not near:
+            break
+        terms = exact_terms(field, pool.poses[near], camera)
+        cost = view_cost_steps(
+            here.cost[tuple(pool.voxels[near].T)], pool.poses[index][:3, :3], pool.poses[near][:, :3, :3], motion
+        )
+        utility = np.array([t.reward for t in terms]) / (cost + settings.view_steps)
+        best = int(utility.argmax())
+        if terms[best].reward < settings.stop_reward:
+            break
+        index = near[best]
+        T = poses[-1]
+        path = plan_path(here, T[:3, 3], pool.voxels[index], density, settings, rng)
+        more = _poses(path, T, pool.poses[index], field, camera, motion, settings, settings.max_steps_per_round)
+        poses = np.concatenate([poses, more])
+        open_views.remove(index)
+        added += 1
+    return poses, added
+
+
+def _movable(space: FreeSpace) -> bool:
+    """Whether the agent can leave the spot it stands on for a place with the full clearance."""
+    return bool((space.reachable & (space.risk.clearance_m >= space.required_m - 1e-6)).any())
+
+
+def _space_terms(space: FreeSpace) -> dict[str, Any]:
+    return {
+        "free_m3": float(space.free.sum() * space.grid.voxel_size**3),
+        "reachable_m3": float(space.reachable.sum() * space.grid.voxel_size**3),
+        "start_clearance_m": float(space.risk.clearance_m[tuple(space.start)]),
+    }
+
+
+def _unstick(
+    round: int,
+    space: FreeSpace,
+    T: np.ndarray,
+    walked: np.ndarray,
+    motion: MotionSettings,
+    settings: PlanningSettings,
+    previous: Decision | None,
+    terms: dict[str, Any],
+) -> Decision:
+    """The agent cannot move: look around once, then go back the way it came, then stop."""
+    tried = None if previous is None else previous.reason
+    if tried not in (Reason.LOOK_AROUND, Reason.BACKTRACK, Reason.START):
+        path = look_around(T, 360.0, settings.bootstrap_pitch_deg, motion)
+        return Decision(round, Reason.LOOK_AROUND, False, path, terms=terms)
+    back = _way_back(space, walked)
+    if tried is not Reason.BACKTRACK and back is not None:
+        path = step_path(T, back, [], motion, settings.max_steps_per_round)
+        if len(path):
+            return Decision(round, Reason.BACKTRACK, False, path, terms=terms)
+    return Decision(round, Reason.STOP_STUCK, True, np.zeros((0, 4, 4)), terms=terms)
+
+
+def _way_back(space: FreeSpace, walked: np.ndarray) -> np.ndarray | None:
+    """Positions from here back along the walked path to the first place with the full clearance, (M, 3)."""
+    positions = walked[::-1, :3, 3]
+    clearance = space.risk.at(positions)[1]
+    good = np.flatnonzero(clearance >= space.required_m)
+    return None if len(good) == 0 or good[0] == 0 else positions[: good[0] + 1]

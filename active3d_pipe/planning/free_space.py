@@ -1,0 +1,152 @@
+"""Where the agent may go: known-free space, clearance, and what of it can be reached."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from active3d_pipe.planning import kernels_distance as kernels
+from active3d_pipe.planning.config import PlanningSettings
+from active3d_pipe.planning.risk_field import RiskField, build_risk_field, joint_occupancy
+from active3d_pipe.structures.motion import MotionSettings
+from active3d_pipe.structures.uncertainty_volume import UncertaintyVolume
+from active3d_pipe.structures.voxel_grid import VoxelGrid
+
+UNREACHABLE = 1e29
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FreeSpace:
+    """Known-free space seen from the current pose.
+
+    Attributes:
+        risk: the risk field (owns the grid, the clearance and the joint occupancy).
+        free: (X, Y, Z) bool, known to be free.
+        passable: (X, Y, Z) bool, the agent's centre may be in this voxel.
+        start: (3,) int64 voxel of the agent.
+        required_m: clearance that `passable` demands away from the start.
+        escape_m: clearance that it demands near the start; smaller when the agent stands in a tight spot.
+        cost: (X, Y, Z) float32 geodesic cost from the start, metres weighted by risk; 1e30 = unreachable.
+        parent: (X, Y, Z) int32 flat id of the predecessor on the cheapest way from the start.
+        planar: motion is confined to the layer of the start voxel.
+    """
+
+    risk: RiskField
+    free: np.ndarray
+    passable: np.ndarray
+    start: np.ndarray
+    required_m: float
+    escape_m: float
+    cost: np.ndarray
+    parent: np.ndarray
+    planar: bool
+
+    @property
+    def grid(self) -> VoxelGrid:
+        """The voxel grid."""
+        return self.risk.grid
+
+    @property
+    def reachable(self) -> np.ndarray:
+        """(X, Y, Z) bool."""
+        return self.cost < UNREACHABLE
+
+    def grid_path(self, goal: np.ndarray) -> np.ndarray:
+        """(N, 3) int64 voxels of the cheapest way from the start to the reachable voxel `goal`, both included."""
+        flat = self.parent.ravel()
+        v = int(np.ravel_multi_index(tuple(int(c) for c in goal), self.grid.shape))
+        ids = [v]
+        while flat[v] >= 0:
+            v = int(flat[v])
+            ids.append(v)
+        return np.stack(np.unravel_index(ids[::-1], self.grid.shape), axis=-1)
+
+
+    def moved_to(self, voxel: np.ndarray, settings: PlanningSettings, longest: float) -> "FreeSpace":
+        """The same space seen from another reachable voxel; costs up to `longest` only."""
+        cost, parent = _geodesic(self.risk, self.passable, voxel, self.planar, settings, longest)
+        return replace(self, start=np.asarray(voxel, dtype=np.int64), cost=cost, parent=parent)
+
+
+def _geodesic(
+    risk: RiskField, passable: np.ndarray, start: np.ndarray, planar: bool, settings: PlanningSettings, longest: float
+) -> tuple[np.ndarray, np.ndarray]:
+    rate = (1 + np.float32(settings.lambda_risk) * risk.risk).astype(np.float32)
+    return kernels.geodesic(
+        passable.view(np.uint8), rate, np.asarray(start, dtype=np.int64), np.float32(risk.grid.voxel_size), planar,
+        np.float32(longest),
+    )
+
+
+def known_free(
+    volume: UncertaintyVolume, occupancy: np.ndarray, walked: np.ndarray, radius_m: float, settings: PlanningSettings
+) -> np.ndarray:
+    """(X, Y, Z) bool, voxels known to be free: rays passed them, none of weight ended in them, O is low.
+
+    The agent's body is a sensor too: a sphere around every pose it stood at is free.
+    """
+    free, hit = volume["free_evidence"], volume["hit_evidence"]
+    out = (free >= settings.min_free_rays) & (occupancy <= settings.max_free_occupancy) & (hit < 2 + 0.02 * free)
+    mark_body(out, volume.grid, walked, radius_m)
+    return out
+
+
+def mark_body(free: np.ndarray, grid: VoxelGrid, centres_world: np.ndarray, radius_m: float) -> None:
+    """Set `free` in every voxel whose centre lies within the radius of one of the positions (N, 3), in place."""
+    reach = int(np.ceil(radius_m / grid.voxel_size)) + 1
+    offsets = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    centres = np.asarray(centres_world, dtype=np.float64).reshape(-1, 3)
+    ijk = grid.index_of(centres)[:, None] + offsets
+    near = np.linalg.norm(grid.centre_of(ijk) - centres[:, None], axis=-1) <= radius_m
+    ijk = ijk[near & grid.contains_index(ijk)]
+    free[tuple(ijk.T)] = True
+
+
+def clearance(free: np.ndarray, voxel_size: float, longest_m: float) -> np.ndarray:
+    """Distance (m, float32) from each voxel centre to the nearest face of a voxel that is not free, truncated.
+
+    The outside of the grid counts as not free: nothing is known about it.
+    """
+    reach = int(np.ceil(longest_m / voxel_size)) + 1
+    blocked = np.pad(~free, 1, constant_values=True).view(np.uint8)
+    squared = kernels.distance_transform(blocked, reach, False)[1:-1, 1:-1, 1:-1]
+    d = (np.sqrt(squared.astype(np.float32)) - np.float32(0.5)) * np.float32(voxel_size)
+    return np.maximum(d, 0)
+
+
+def build_free_space(
+    volume: UncertaintyVolume,
+    T_world_camera: np.ndarray,
+    walked: np.ndarray,
+    motion: MotionSettings,
+    settings: PlanningSettings,
+    *,
+    relaxed: bool = False,
+) -> FreeSpace:
+    """Known-free space, risk field and geodesic distances from the current pose.
+
+    Args:
+        walked: (N, 3) world positions of the poses walked so far, the current one included.
+        relaxed: demand only the agent's radius as clearance, without the margin.
+    """
+    grid = volume.grid
+    occupancy = joint_occupancy(volume.arrays, settings)
+    free = known_free(volume, occupancy, walked, motion.agent_radius_m, settings)
+    preferred = max(settings.preferred_clearance_m, motion.agent_radius_m + settings.clearance_margin_m)
+    clear = clearance(free, grid.voxel_size, preferred)
+    risk = build_risk_field(grid, occupancy, clear, motion.agent_radius_m, preferred)
+    required = motion.agent_radius_m + (0.0 if relaxed else settings.clearance_margin_m)
+    position = T_world_camera[:3, 3]
+    start = np.clip(grid.index_of(position), 0, np.asarray(grid.shape) - 1)
+    passable = clear >= required - 1e-6
+    escape = min(required, float(clear[tuple(start)]))
+    if escape < required:
+        low = np.maximum(start - int(settings.escape_m / grid.voxel_size) - 1, 0)
+        high = start + int(settings.escape_m / grid.voxel_size) + 2
+        box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+        ijk = np.stack(np.meshgrid(*(np.arange(grid.shape[i])[box[i]] for i in range(3)), indexing="ij"), -1)
+        near = np.linalg.norm(grid.centre_of(ijk) - position, axis=-1) <= settings.escape_m
+        passable[box] |= near & (clear[box] >= escape - 1e-6) & free[box]
+    passable[tuple(start)] = True
+    planar = motion.model == "ground"
+    cost, parent = _geodesic(risk, passable, start, planar, settings, UNREACHABLE)
+    return FreeSpace(risk, free, passable, start, required, escape, cost, parent, planar)

@@ -1,0 +1,157 @@
+"""The reward of candidate views: eq. nbv_reward and nbv_eig over many poses at once.
+
+Two evaluations of the same sum. `sphere_rewards` casts one sphere of rays for a position and adds up every view
+direction from it: thousands of views in the time of some hundred positions. `exact_terms` casts the dense ray fan
+of single views and returns their `GainTerms`. Unknown space lets rays pass, but not for ever: each open voxel takes
+the share 1 - exp(-size / free path), so a voxel counts with the probability that it is visible at all.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from active3d_pipe.geometry.voxel_traversal import fan_stride, ray_fan
+from active3d_pipe.information.config import InformationSettings
+from active3d_pipe.information.gain import FREE, OPEN, SURFACE, GainTerms, InformationVolumes, information_volumes
+from active3d_pipe.planning import kernels_distance
+from active3d_pipe.planning import kernels_reward as kernels
+from active3d_pipe.planning.candidates import Directions
+from active3d_pipe.planning.config import PlanningSettings
+from active3d_pipe.structures.camera import Camera
+from active3d_pipe.structures.uncertainty_volume import UncertaintyVolume
+from active3d_pipe.structures.voxel_grid import VoxelGrid
+
+# Longest jump of a ray through seen free space, voxels.
+LONGEST_SKIP = 12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RewardField:
+    """Everything a view's reward is computed from, flat in C order where kernels read it."""
+
+    grid: VoxelGrid
+    information: InformationSettings
+    max_range_m: float
+    kind: np.ndarray
+    opaque: np.ndarray
+    skip: np.ndarray
+    value: np.ndarray
+    through: np.ndarray
+    surface_value: np.ndarray
+    quality: np.ndarray
+    normal: np.ndarray
+    gain_imp: np.ndarray
+    gain_exp: np.ndarray
+
+    def without(self, visible: np.ndarray) -> "RewardField":
+        """The same field after the voxels `visible` (flat ids) have been seen: nothing is left to gain in them."""
+        changed = {name: getattr(self, name).copy() for name in ("value", "surface_value", "gain_imp", "gain_exp")}
+        for a in changed.values():
+            a[visible] = 0
+        fields = {name: getattr(self, name) for name in self.__slots__}
+        return RewardField(**{**fields, **changed})
+
+
+def build_reward_field(
+    volume: UncertaintyVolume,
+    walked_poses: np.ndarray,
+    camera: Camera,
+    settings: PlanningSettings,
+) -> RewardField:
+    """Prepare the volumes. `walked_poses` (N, 4, 4) tell which open voxels were looked at in vain."""
+    grid, information = volume.grid, settings.information
+    reach = min(settings.max_range_m, camera.far)
+    first = information_volumes(volume.arrays, information)
+    kind = first.kind
+    through = _transmittance(volume, kind, settings)
+    normal = np.zeros((*grid.shape, 3), np.int8)
+    kernels.surface_normals(kind, normal)
+    skip = kernels_distance.distance_transform((kind != FREE).view(np.uint8), LONGEST_SKIP, True).astype(np.uint8)
+    opaque = (kind == SURFACE).view(np.uint8).ravel()
+    looks = _looks(grid, opaque, through, walked_poses, camera, reach, settings)
+    credit = np.where(
+        (kind == OPEN).ravel(), np.float32(settings.credit_factor) ** looks.astype(np.float32), np.float32(1)
+    )
+    volumes: InformationVolumes = information_volumes(volume.arrays, information, credit.reshape(grid.shape))
+    return RewardField(
+        grid, information, reach, kind.ravel(), opaque, skip.ravel(), volumes.value.ravel(), through,
+        volumes.surface_value.ravel(), np.ascontiguousarray(volumes.quality).ravel(), normal.reshape(-1, 3),
+        volumes.gain_imp.ravel(), volumes.gain_exp.ravel(),
+    )
+
+
+def _transmittance(volume: UncertaintyVolume, kind: np.ndarray, settings: PlanningSettings) -> np.ndarray:
+    """Share of rays that an open voxel lets pass; less where the field believes in something solid. Flat."""
+    passes = np.exp(-volume.grid.voxel_size / settings.unknown_free_path_m)
+    solid = np.clip(2 - 2 * volume["occupancy"], 0, 1)
+    return np.where(kind == OPEN, passes * solid, np.where(kind == FREE, 1, 0)).astype(np.float32).ravel()
+
+
+def spread_poses(poses: np.ndarray, count: int) -> np.ndarray:
+    """Indices of `count` well-spread poses (N, 4, 4): farthest-point order in position + viewing direction.
+
+    The newest pose is the first; ties go to the newer one. Half a metre counts as much as 30 degrees.
+    """
+    x = np.concatenate([poses[:, :3, 3] / 0.5, poses[:, :3, 2] / 0.52], axis=1)[::-1]
+    count = min(count, len(x))
+    chosen = [0]
+    distance = np.linalg.norm(x - x[0], axis=1)
+    while len(chosen) < count:
+        new = int(distance.argmax())
+        chosen.append(new)
+        distance = np.minimum(distance, np.linalg.norm(x - x[new], axis=1))
+    return len(x) - 1 - np.asarray(chosen[:count], dtype=np.int64)
+
+
+def _looks(
+    grid: VoxelGrid,
+    opaque: np.ndarray,
+    through: np.ndarray,
+    poses: np.ndarray,
+    camera: Camera,
+    reach: float,
+    settings: PlanningSettings,
+) -> np.ndarray:
+    """How many of the past views should have settled each voxel, (size,) uint8."""
+    looks = np.zeros(grid.size, np.uint8)
+    if len(poses) == 0 or settings.credit_views == 0:
+        return looks
+    # Coarser rays than for scoring: a voxel that only a corner of the fan touches was not really looked at.
+    fan = ray_fan(camera, 2 * fan_stride(camera, grid.voxel_size, reach))[2].astype(np.float32)
+    stamp = np.full(grid.size, -1, np.int32)
+    for mark, index in enumerate(spread_poses(poses, settings.credit_views)):
+        origin = ((poses[index, :3, 3] - grid.origin) / grid.voxel_size).astype(np.float32)
+        kernels.count_looks(
+            opaque, through, origin, poses[index, :3, :3].astype(np.float32), fan, grid.shape,
+            np.float32(grid.voxel_size), np.float32(reach), stamp, mark, looks,
+        )
+    return looks
+
+
+def sphere_rewards(field: RewardField, positions_world: np.ndarray, directions: Directions) -> np.ndarray:
+    """(P, V) float32 reward of every view direction from every position (P, 3)."""
+    grid, info = field.grid, field.information
+    origins = ((positions_world - grid.origin) / grid.voxel_size).astype(np.float32)
+    rays = kernels.sphere_gain(
+        np.ascontiguousarray(origins), directions.rays / np.float32(grid.voxel_size), directions.solid_angles,
+        field.kind, field.skip, field.value, field.through, field.surface_value, field.quality, field.normal,
+        grid.shape, np.float32(grid.voxel_size), np.float32(field.max_range_m), np.float32(info.enough_quality),
+        np.float32(info.quality_range_m),
+    )
+    return rays @ directions.members.T
+
+
+def exact_terms(field: RewardField, poses: np.ndarray, camera: Camera, ray_stride: int | None = None) -> list[GainTerms]:
+    """`GainTerms` of every pose (C, 4, 4) over its unique visible voxels, unknown ones by their visibility."""
+    if len(poses) == 0:
+        return []
+    grid, info = field.grid, field.information
+    stride = ray_stride or fan_stride(camera, grid.voxel_size, field.max_range_m)
+    sums = kernels.frustum_gain(
+        np.ascontiguousarray((poses[:, :3, 3] - grid.origin) / grid.voxel_size, dtype=np.float32),
+        np.ascontiguousarray(poses[:, :3, :3], dtype=np.float32), ray_fan(camera, stride)[2].astype(np.float32),
+        field.opaque, field.kind, field.value, field.through, field.surface_value, field.quality, field.normal,
+        field.gain_imp, field.gain_exp, grid.shape, np.float32(grid.voxel_size), np.float32(field.max_range_m),
+        np.float32(info.enough_quality), np.float32(info.quality_range_m),
+    )
+    return [GainTerms(s[0], s[1], s[2], s[3], round(s[4]), round(s[5])) for s in sums.tolist()]
