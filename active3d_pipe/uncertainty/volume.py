@@ -71,8 +71,10 @@ def compute_volume(  # noqa: PLR0913  (the inputs of the stage, by name)
     u_exp = attention * explicit.explicit_uncertainty(grid, views, last_u_exp, settings)
     u_time = np.zeros(grid.shape, np.float32)
     if previous is not None:
-        # A field that moves in space known to be free before and after is a phantom; space freed now is news.
-        relevant = observed * np.maximum(attention, occupancy.attention(before, settings))
+        # What the field does in space known to be free is a phantom, unless this round's rays found it otherwise;
+        # space that was not known to be free before the round, and is now, is news.
+        found = np.where(fresh.free + fresh.hit > 0, occupancy.attention(fresh, settings), 0)
+        relevant = observed * np.maximum(found, occupancy.attention(before, settings))
         u_time = temporal.temporal_uncertainty(sdf, previous["sdf"], previous["u_time"], relevant, settings)
 
     rows, targets = revealed_rows(grid, previous, fresh, predicted, settings)

@@ -59,8 +59,8 @@ def frame(step, T, camera=CAMERA, box=True):
     return Frame(step, step * 100_000_000, camera, T, colour_image(T, camera), trace(T, camera, box))
 
 
-def frames(yaws=(-30, 0, 30), first_step=0, **where):
-    return [frame(first_step + i, pose(y, **where)) for i, y in enumerate(yaws)]
+def frames(yaws=(-30, 0, 30), first_step=0, box=True, **where):
+    return [frame(first_step + i, pose(y, **where), box=box) for i, y in enumerate(yaws)]
 
 
 def residual(f, depth_error=0.0, color_error=0.0, alpha=1.0) -> ViewResidual:
