@@ -14,6 +14,8 @@ from active3d_pipe.field.config import FieldSettings
 from active3d_pipe.structures import Frame
 
 MIN_SLOPE = 0.1  # rays that graze a surface by less than about 6 degrees are taken at this slope
+REDRAWS = 3
+NEIGHBOURS = ((0, 1), (0, -1), (1, 0), (-1, 0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,64 +54,80 @@ def sample_rays(
         rng: source of randomness.
         weights: (len(frames),) relative probabilities of the frames; uniform when None.
 
-    Pixels without a depth reading are drawn anew up to three times; what is still without one stays in the
+    Pixels without a depth reading are drawn anew up to `REDRAWS` times; what is still without one stays in the
     batch with `valid` False. Rays come grouped by frame.
     """
     if not frames:
         raise InputError("field: no frames to draw rays from; expected at least one key frame")
     p = None if weights is None else np.asarray(weights, dtype=np.float64) / np.sum(weights)
-    per_frame = np.bincount(rng.choice(len(frames), size=count, p=p), minlength=len(frames))
-    parts = [_rays_of(frames[i], int(n), rng) for i, n in enumerate(per_frame) if n]
-    return RayBatch(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    of_ray = np.sort(rng.choice(len(frames), size=count, p=p))
+    draws = rng.random((count, 1 + REDRAWS), dtype=np.float32)
+    taken, first, per_frame = np.unique(of_ray, return_index=True, return_counts=True)
+    # Only the gathering runs frame by frame; the arithmetic is done once for the whole batch.
+    parts = [_gather(frames[k], draws[i : i + n]) for k, i, n in zip(taken, first, per_frame, strict=True)]
+    pixel, z, rgb = (np.concatenate(column) for column in zip(*parts, strict=True))
+    camera = np.repeat([_intrinsics(frames[k]) for k in taken], per_frame, axis=0).astype(np.float32)
+    poses = np.repeat([frames[k].T_world_camera for k in taken], per_frame, axis=0)
+    u = (pixel + np.float32(0.5) - camera[:, 2:4]) / camera[:, :2]
+    local = np.column_stack([u, np.ones(count, np.float32)])
+    valid = (z[:, 0] > 0) & (z[:, 0] <= camera[:, 4])
+    return RayBatch(
+        origins=poses[:, :3, 3].astype(np.float32),
+        directions=np.einsum("rij,rj->ri", poses[:, :3, :3], local).astype(np.float32),
+        depth=np.where(valid, z[:, 0], 0).astype(np.float32),
+        color=rgb.astype(np.float32) / np.float32(255),
+        valid=valid,
+        slope=_slope(z, local, camera[:, :2]),
+    )
 
 
-def _rays_of(frame: Frame, count: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    camera, depth = frame.camera, frame.depth
-    flat = rng.integers(0, depth.size, size=count)
-    far = np.float32(camera.far)
-    for _ in range(3):
-        d = depth.reshape(-1)[flat]
-        bad = (d <= 0) | (d > far)
-        if not bad.any():
-            break
-        flat[bad] = rng.integers(0, depth.size, size=int(bad.sum()))
-    i, j = np.divmod(flat, camera.width)
-    d = depth[i, j]
-    valid = (d > 0) & (d <= far)
-    T = frame.T_world_camera
-    local = np.stack([(j + 0.5 - camera.cx) / camera.fx, (i + 0.5 - camera.cy) / camera.fy, np.ones(count)], axis=1)
-    directions = (local @ T[:3, :3].T).astype(np.float32)
-    origins = np.broadcast_to(T[:3, 3].astype(np.float32), (count, 3))
-    slope = _slope(frame, i, j, local.astype(np.float32))
-    color = frame.rgb[i, j].astype(np.float32) / np.float32(255)
-    return origins, directions, np.where(valid, d, 0).astype(np.float32), color, valid, slope
+def _intrinsics(frame: Frame) -> tuple[float, float, float, float, float]:
+    c = frame.camera
+    return c.fx, c.fy, c.cx, c.cy, c.far
 
 
-def _slope(frame: Frame, i: np.ndarray, j: np.ndarray, local: np.ndarray) -> np.ndarray:
-    """(N,) |normal . direction| at pixels (i, j), from depth differences to the nearer neighbours in depth."""
-    camera, depth = frame.camera, frame.depth
-    z = depth[i, j]
+def _gather(frame: Frame, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the frame shows at random pixels, for n rays with draws (n, D) in 0..1.
 
-    def tangent(di: int, dj: int) -> tuple[np.ndarray, np.ndarray]:
-        best, out = np.full(len(z), np.inf, np.float32), np.zeros((len(z), 3), np.float32)
-        for s in (1, -1):
-            ni, nj = i + s * di, j + s * dj
-            ok = (ni >= 0) & (ni < camera.height) & (nj >= 0) & (nj < camera.width)
-            nz = depth[np.clip(ni, 0, camera.height - 1), np.clip(nj, 0, camera.width - 1)]
-            ok &= nz > 0
-            gap = np.where(ok, np.abs(nz - z), np.inf).astype(np.float32)
-            take = gap < best
-            u = local[:, 0] + np.float32(s * dj / camera.fx)
-            v = local[:, 1] + np.float32(s * di / camera.fy)
-            point = np.stack([u * nz, v * nz, nz], axis=1)
-            out[take] = (np.float32(s) * (point - local * z[:, None]))[take]
-            best = np.minimum(best, gap)
-        return out, np.isfinite(best)
+    Returns pixels (n, 2) float32 (column, row), depths (n, 5) of the pixel and its neighbours right, left,
+    below, above (0 outside the image), and colours (n, 3) uint8. The first of the D pixels with a reading counts.
+    """
+    height, width = frame.depth.shape
+    flat = np.minimum((draws * np.float64(frame.depth.size)).astype(np.int64), frame.depth.size - 1)
+    d = frame.depth.reshape(-1)[flat]
+    choice = ((d > 0) & (d <= np.float32(frame.camera.far))).argmax(axis=1)
+    rows = np.arange(len(flat))
+    flat = flat[rows, choice]
+    i, j = np.divmod(flat, width)
+    z = np.zeros((len(flat), 5), np.float32)
+    z[:, 0] = d[rows, choice]
+    for k, (di, dj) in enumerate(NEIGHBOURS, start=1):
+        ni, nj = i + di, j + dj
+        ok = (ni >= 0) & (ni < height) & (nj >= 0) & (nj < width)
+        z[ok, k] = frame.depth[ni[ok], nj[ok]]
+    return np.column_stack([j, i]).astype(np.float32), z, frame.rgb.reshape(-1, 3)[flat]
 
-    (along_i, ok_i), (along_j, ok_j) = tangent(1, 0), tangent(0, 1)
-    normal = np.cross(along_i, along_j)
+
+def _slope(z: np.ndarray, local: np.ndarray, focal: np.ndarray) -> np.ndarray:
+    """(R,) |normal . direction| from depths (R, 5), directions in the camera frame (R, 3), focal lengths (R, 2).
+
+    Along each image axis the neighbour nearer in depth is taken, so that an edge does not tilt the normal; 1 where
+    an axis has no neighbour with a reading.
+    """
+
+    def tangent(first: int, axis: int) -> tuple[np.ndarray, np.ndarray]:
+        gap = np.where(z[:, first : first + 2] > 0, np.abs(z[:, first : first + 2] - z[:, :1]), np.inf)
+        pick = gap.argmin(axis=1)
+        side = np.where(pick == 0, np.float32(1), np.float32(-1))
+        direction = local.copy()
+        direction[:, axis] += side / focal[:, axis]
+        other = direction * z[np.arange(len(z)), first + pick][:, None]
+        return side[:, None] * (other - local * z[:, :1]), np.isfinite(gap.min(axis=1))
+
+    (along_u, ok_u), (along_v, ok_v) = tangent(1, 0), tangent(3, 1)
+    normal = np.cross(along_u, along_v)
     norm = np.linalg.norm(normal, axis=1)
-    ok = ok_i & ok_j & (norm > 0)
+    ok = ok_u & ok_v & (norm > 0)
     slope = np.abs((normal * local).sum(axis=1)) / np.where(ok, norm, 1)
     return np.where(ok, np.maximum(slope, MIN_SLOPE), 1).astype(np.float32)
 
