@@ -1,1 +1,1 @@
-
+"""Mesh and Gaussians out of the map."""

@@ -35,7 +35,7 @@ class FieldSettings(Settings):
     free_samples: int = Field(6, ge=0, description="stratified samples a ray between camera and truncation band")
     surface_samples: int = Field(9, gt=1, description="stratified samples a ray within the truncation band")
     behind_fraction: float = Field(
-        1.0, gt=0, le=1, description="part of the truncation band behind the surface that is sampled"
+        0.5, gt=0, le=1, description="part of the truncation band behind the surface that is sampled"
     )
     prior_points: int = Field(512, ge=0, description="random points per iteration that hold unseen space at its prior")
 
