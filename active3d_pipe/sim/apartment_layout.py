@@ -5,7 +5,7 @@ Room rectangles are centre lines of walls; the inner face of a wall lies HALF_WA
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -142,6 +142,8 @@ def make_layout(count: int, rng: np.random.Generator) -> list[Room]:
         _door(rooms, i, j, rng)
     for room in rooms:
         _windows(room, rng)
+    for room in rooms:
+        _drop_obstructed_leaves(room)
     return rooms
 
 
@@ -197,6 +199,27 @@ def _door(rooms: list[Room], i: int, j: int, rng: np.random.Generator) -> None:
         hinge = (1 if length - b < a else -1) if leaf else 0
         other = j if room == i else i
         rooms[room].openings[own_side].append(Opening("door", a, b, 0.0, DOOR_HEIGHT, other, hinge))
+
+
+def _drop_obstructed_leaves(room: Room) -> None:
+    """Remove open door leaves that would stand in front of another opening near the same corner."""
+    swept = DOOR_WIDTH + 0.25
+    for side, openings in enumerate(room.openings):
+        length = room.side(side)[3]
+        for k, o in enumerate(openings):
+            if not o.leaf:
+                continue
+            if o.leaf > 0:
+                beyond, reach = room.openings[(side + 1) % 4], length - o.stop
+                obstructed = reach < swept and any(p.start < swept for p in beyond)
+                obstructed |= any(0 <= p.start - o.stop < 0.5 for p in openings)
+            else:
+                end = room.side((side - 1) % 4)[3]
+                beyond, reach = room.openings[(side - 1) % 4], o.start
+                obstructed = reach < swept and any(p.stop > end - swept for p in beyond)
+                obstructed |= any(0 <= o.start - p.stop < 0.5 for p in openings)
+            if obstructed:
+                openings[k] = replace(o, leaf=0)
 
 
 def _windows(room: Room, rng: np.random.Generator) -> None:
