@@ -38,7 +38,6 @@ def _parameters(config: Any, inputs: Mapping[NodeId, Path]) -> dict[str, Any]:
 
 def _run(context: StageContext) -> None:
     from active3d_pipe.planning.decide import bootstrap_decision
-
     from active3d_pipe.sim.execute import execute_path
     from active3d_pipe.storage import capture_log
     from active3d_pipe.storage.files import read_json, write_json
@@ -49,7 +48,7 @@ def _run(context: StageContext) -> None:
     rig: dict[str, Any] | None = None
     if context.round == 0:
         start = simulator.scene.start_pose
-        path = np.concatenate([start[None], bootstrap_decision(start, config.motion, config.planning).path])
+        path = bootstrap_decision(start, config.motion, config.planning).path
         current, first_step = start, 0
         low, high = simulator.scene.bounds_low, simulator.scene.bounds_high
         rig = {
@@ -85,6 +84,7 @@ def _run(context: StageContext) -> None:
 
 STAGE = Stage(
     name="capture", version=1,
-    config=("scene", "camera", "sensor", "motion", "planning.bootstrap_turn_deg", "run.seed"),
+    config=("scene", "camera", "sensor", "motion", "planning.bootstrap_turn_deg", "planning.bootstrap_pitch_deg",
+        "run.seed",),
     inputs=_inputs, run=_run, loop=True, parameters=_parameters,
 )

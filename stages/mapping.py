@@ -11,9 +11,9 @@ def _inputs(round: int) -> tuple[NodeId, ...]:
 
 def _run(context: StageContext) -> None:
     import numpy as np
+
     from active3d_pipe.mapping.hybrid_map import HybridMap
     from active3d_pipe.mapping.update import update_map
-
     from active3d_pipe.storage import volumes
     from active3d_pipe.storage.files import write_json
 

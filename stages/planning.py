@@ -11,7 +11,6 @@ def _inputs(round: int) -> tuple[NodeId, ...]:
 
 def _run(context: StageContext) -> None:
     from active3d_pipe.planning.decide import decide
-
     from active3d_pipe.storage import volumes
     from active3d_pipe.storage.files import read_json, write_json
     from active3d_pipe.structures import Camera, Decision

@@ -1,9 +1,9 @@
 """What several stages need: cached frames, cached simulator, the map on disk."""
 
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -12,10 +12,11 @@ from active3d_pipe.pipeline.stage import NodeId
 if TYPE_CHECKING:
     from active3d_pipe.mapping.hybrid_map import HybridMap
     from active3d_pipe.sim.simulator import Simulator
+    from active3d_pipe.structures import Camera, Frame
 
-    from active3d_pipe.structures import Frame
-
-LOG_NAME, CAPTURE_NAME, VOLUME_NAME, DECISION_NAME = "frames.mcap", "capture.json", "volume.zarr", "decision.json"
+T = TypeVar("T")
+LOG_NAME, CAPTURE_NAME, DECISION_NAME = "frames.mcap", "capture.json", "decision.json"
+VOLUME_NAME, SURFACE_NAME = "volume.zarr", "surface.ply"
 CACHE_BYTES = 1 << 30  # decoded frames kept in memory between the stages of one process
 
 _frames: "OrderedDict[tuple, list[Frame]]" = OrderedDict()
@@ -51,13 +52,6 @@ def load_rig(inputs: Mapping[NodeId, Path]) -> dict[str, Any]:
     return read_json(inputs[NodeId("capture", 0)] / CAPTURE_NAME)["rig"]
 
 
-def volume_grid(rig: dict[str, Any], voxel_size: float) -> Any:
-    """The voxel grid over the box to explore."""
-    from active3d_pipe.structures import VoxelGrid
-
-    return VoxelGrid.from_bounds(np.array(rig["bounds"][0]), np.array(rig["bounds"][1]), voxel_size)
-
-
 def make_simulator(config: Any, seed: int) -> "Simulator":
     """The simulator of this configuration, made once a process."""
     from active3d_pipe.sim.simulator import make_simulator as make
@@ -67,6 +61,27 @@ def make_simulator(config: Any, seed: int) -> "Simulator":
         _simulators.clear()
         _simulators[key] = make(config.scene, config.camera, config.sensor, seed)
     return _simulators[key]
+
+
+def thinned(frame: "Frame", stride: int) -> "tuple[np.ndarray, np.ndarray, Camera]":
+    """Every n-th pixel of a frame: rgb float32 0..1 (block means), depth (of the block's middle pixel), camera."""
+    from active3d_pipe.structures import Camera
+
+    h, w = frame.camera.height // stride, frame.camera.width // stride
+    c = frame.camera
+    blocks = frame.rgb[: h * stride, : w * stride].reshape(h, stride, w, stride, 3)
+    rgb = blocks.astype(np.float32).mean(axis=(1, 3)) * np.float32(1 / 255)
+    offset = stride // 2
+    depth = np.ascontiguousarray(frame.depth[offset : h * stride : stride, offset : w * stride : stride])
+    return rgb, depth, Camera(w, h, c.fx / stride, c.fy / stride, c.cx / stride, c.cy / stride, c.near, c.far)
+
+
+def spread(items: "Sequence[T]", most: int) -> "list[T]":
+    """At most `most` items, evenly spread over the sequence, the last one included."""
+    if len(items) <= most:
+        return list(items)
+    chosen = np.unique(np.linspace(0, len(items) - 1, most).round().astype(int))
+    return [items[int(i)] for i in chosen]
 
 
 def walked_poses(inputs: Mapping[NodeId, Path], last_round: int) -> np.ndarray:
@@ -91,7 +106,6 @@ def save_map(folder: Path, hybrid: "HybridMap") -> None:
 def load_map(folder: Path, inputs: Mapping[NodeId, Path], config: Any) -> "HybridMap":
     """Read a map; its keyframes' images come from the capture logs among `inputs`."""
     from active3d_pipe.mapping.hybrid_map import HybridMap
-
     from active3d_pipe.mapping.keyframes import Keyframe
     from active3d_pipe.storage.files import read_json, read_tensors
 

@@ -1,7 +1,20 @@
 """Uncertainty: where is the map poor?"""
 
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 from active3d_pipe.pipeline.stage import NodeId, Stage, StageContext
 from stages import shared
+
+if TYPE_CHECKING:
+    from active3d_pipe.mapping.hybrid_map import HybridMap
+    from active3d_pipe.structures import Frame, UncertaintyVolume
+    from active3d_pipe.uncertainty.explicit import ViewResidual
+
+EXAMINED = 24  # keyframes whose residuals are looked at in a round
+PREDICT_EVERY = 2  # every n-th new frame is predicted by the map of the round before
+RESIDUAL_STRIDE = 2  # residual images have this fraction of the camera's resolution
 
 
 def _inputs(round: int) -> tuple[NodeId, ...]:
@@ -9,34 +22,72 @@ def _inputs(round: int) -> tuple[NodeId, ...]:
     return (*shared.captures(round), NodeId("mapping", round), *before)
 
 
+def _residuals(hybrid: "HybridMap", frames: "Sequence[Frame]", timings: dict[str, float]) -> "list[ViewResidual]":
+    """Errors of the map's renderings at the frames' poses, at a reduced resolution."""
+    from active3d_pipe.uncertainty.explicit import view_residuals
+
+    start = time.perf_counter()
+    out = []
+    for frame in frames:
+        rgb, depth, camera = shared.thinned(frame, RESIDUAL_STRIDE)
+        view = hybrid.render(camera, frame.T_world_camera)
+        out.append(view_residuals(view.rgb, view.depth, view.alpha, rgb, depth, camera, frame.T_world_camera))
+    timings["residuals"] = timings.get("residuals", 0.0) + time.perf_counter() - start
+    return out
+
+
 def _run(context: StageContext) -> None:
-    from active3d_pipe.mapping.views import predict_views, uncertain_views
-    from active3d_pipe.uncertainty.volume import compute_volume
+    import numpy as np
 
     from active3d_pipe.storage import volumes
+    from active3d_pipe.uncertainty.volume import compute_volume, make_grid
 
     config, k = context.config, context.round
-    grid = shared.volume_grid(shared.load_rig(context.inputs), config.uncertainty.voxel_size_m)
+    bounds = np.array(shared.load_rig(context.inputs)["bounds"])
+    grid = make_grid(bounds[0], bounds[1], config.uncertainty)
     frames = shared.load_frames(context.input("capture", k))
     hybrid = shared.load_map(context.input("mapping", k), context.inputs, config)
     previous, predicted = None, []
     if k > 0:
         previous = volumes.read_volume(context.input("uncertainty", k - 1) / shared.VOLUME_NAME)
         before = shared.load_map(context.input("mapping", k - 1), context.inputs, config)
-        predicted = predict_views(before, frames, config.uncertainty.predicted_views)
-    views = uncertain_views(hybrid, config.uncertainty.examined_views, context.rng("examined views"))
+        predicted = _residuals(before, frames[::PREDICT_EVERY], context.timings)
+    examined = shared.spread(hybrid.keyframes, EXAMINED)
+    views = _residuals(hybrid, [key.frame for key in examined], context.timings)
+    start = time.perf_counter()
     volume = compute_volume(
-        grid=grid, round=k, previous=previous, field_query=hybrid.query_sdf_sigma, gaussians=hybrid.gaussians.to_model(),
-        new_frames=frames, views=views, predicted=predicted, settings=config.uncertainty,
+        grid=grid, round=k, previous=previous, field_query=hybrid.field.query_geometry,
+        gaussians=hybrid.gaussians.to_model(), new_frames=frames, views=views, predicted=predicted,
+        settings=config.uncertainty,
     )
+    context.timings["volume"] = time.perf_counter() - start
     volumes.write_volume(context.out / shared.VOLUME_NAME, volume)
+    _write_surface(context, hybrid, volume)
     observed = volume.observed
     context.notes.update(
         coverage=round(float(observed.mean()), 5),
         mean_uncertainty=round(float(volume["u_final"][observed].mean()), 6) if observed.any() else 0.0,
-        entropy_bits=round(float(volume["entropy"].sum()), 2),
+        entropy_bits=round(float(volume["entropy"].sum(dtype=np.float64)), 2),
         alphas=[round(float(a), 5) for a in volume.fusion.get("alphas", [])],
     )
 
 
-STAGE = Stage(name="uncertainty", version=1, config=("uncertainty", "mapping"), inputs=_inputs, run=_run, loop=True)
+def _write_surface(context: StageContext, hybrid: "HybridMap", volume: "UncertaintyVolume") -> None:
+    """The coarse surface of this round, for the curves over steps and for looking at progress."""
+    from active3d_pipe.export.config import MeshSettings
+    from active3d_pipe.export.isosurface import extract_mesh, near_surface
+    from active3d_pipe.storage import meshes
+
+    start = time.perf_counter()
+    settings = MeshSettings(voxel_size_m=context.config.export.preview_voxel_m)
+    observed = near_surface(volume["hit_evidence"], settings.dilate_voxels)
+    field = hybrid.field
+    mesh = extract_mesh(field.query_sdf, field.low, field.high, settings, grid=volume.grid, observed=observed)
+    meshes.write_mesh_ply(context.out / shared.SURFACE_NAME, mesh)
+    context.timings["surface"] = time.perf_counter() - start
+
+
+STAGE = Stage(
+    name="uncertainty", version=1, config=("uncertainty", "mapping", "export.preview_voxel_m"),
+    inputs=_inputs, run=_run, loop=True,
+)

@@ -12,7 +12,7 @@ from active3d_pipe.structures import Settings
 class KeyframeSettings(Settings):
     """Which frames become keyframes (eq. kf_selection)."""
 
-    policy: Literal["uncertainty", "every_n"] = Field("uncertainty", description="the paper's rule, or every n-th frame")
+    policy: Literal["uncertainty", "every_n"] = Field("uncertainty", description="eq. kf_selection, or every n-th")
     every_n: int = Field(5, ge=1, description="policy every_n: distance between keyframes, steps")
     tau_view: float = Field(0.18, ge=0, le=1, description="least viewpoint divergence delta_c from every keyframe")
     tau_info: float = Field(25.0, ge=0, description="least hybrid information gain of a frame, bits")
@@ -24,7 +24,7 @@ class KeyframeSettings(Settings):
 class WindowSettings(Settings):
     """Which keyframes are optimised together (eq. sw_energy)."""
 
-    policy: Literal["viewpoint", "temporal"] = Field("viewpoint", description="neighbours in viewpoint space, or in time")
+    policy: Literal["viewpoint", "temporal"] = Field("viewpoint", description="nearest in viewpoint space or in time")
     size: int = Field(10, ge=1, description="keyframes in the window, m")
     replay: float = Field(0.3, ge=0, le=1, description="share of iterations on random older keyframes (E_reg)")
 

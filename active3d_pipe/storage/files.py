@@ -56,7 +56,7 @@ def write_tensors(path: Path, tensors: dict[str, np.ndarray], document: Any = No
     """
     from safetensors.numpy import save
 
-    contiguous = {name: np.ascontiguousarray(a) for name, a in sorted(tensors.items())}
+    contiguous = {name: np.asarray(a, order="C") for name, a in sorted(tensors.items())}
     blob = save(contiguous, metadata={"active3d": json.dumps(document, sort_keys=True)})
     with writing(path):
         path.write_bytes(blob)

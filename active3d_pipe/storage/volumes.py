@@ -67,6 +67,15 @@ def read_volume(path: Path) -> UncertaintyVolume:
         return UncertaintyVolume(grid, int(group["round"][0]), arrays, json.loads(json.dumps(group.attrs["fusion"])))
 
 
+def read_fusion(path: Path) -> dict[str, Any]:
+    """What evidence maximisation found, without reading the volumes."""
+    import zarr
+
+    with reading(path, "a Zarr group written by active3d"):
+        root: Any = zarr.open_group(store=str(path), mode="r", zarr_format=3)
+        return dict(root[GROUP].attrs["fusion"])
+
+
 def _write_axis(group: Any, name: str, values: np.ndarray, unit: str, codec: Any) -> None:
     array = group.create_array(
         name, shape=values.shape, chunks=values.shape, dtype=values.dtype, compressors=codec,

@@ -153,13 +153,15 @@ def test_mesh_round_trip_and_glb_stands_upright(tmp_path: Path) -> None:
 
 
 def test_tensors_round_trip_same_bytes_and_damage(tmp_path: Path) -> None:
-    tensors = {"b": np.arange(5, dtype=np.float32), "a": np.ones((2, 3), np.int64)}
+    tensors = {"b": np.arange(5, dtype=np.float32), "a": np.ones((2, 3), np.int64), "scalar": np.array(2.0)}
     files.write_tensors(tmp_path / "t1", tensors, {"step": 3, "names": ["x"]})
     files.write_tensors(tmp_path / "t2", dict(reversed(tensors.items())), {"names": ["x"], "step": 3})
     assert (tmp_path / "t1").read_bytes() == (tmp_path / "t2").read_bytes()
     read, document = files.read_tensors(tmp_path / "t1")
     assert document == {"step": 3, "names": ["x"]}
-    np.testing.assert_array_equal(read["a"], tensors["a"])
+    for name, array in tensors.items():
+        assert read[name].shape == array.shape
+        np.testing.assert_array_equal(read[name], array)
     (tmp_path / "t1").write_bytes(b"\xff" * 40)
     with pytest.raises(ArtifactError, match="t1"):
         files.read_tensors(tmp_path / "t1")

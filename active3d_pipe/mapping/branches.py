@@ -1,0 +1,122 @@
+"""The moves that `update_map` and `refine` are made of: seed, train one branch, couple, add, prune."""
+
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from active3d_pipe.field.optimise import field_step
+from active3d_pipe.field.rays import sample_rays
+from active3d_pipe.gaussians.optimisation import optimise_step
+from active3d_pipe.gaussians.pruning import prune_mask
+from active3d_pipe.gaussians.sdf_coupling import sdf_gradient
+from active3d_pipe.gaussians.seeding import error_driven, seed_frame
+from active3d_pipe.mapping.hybrid_map import HybridMap
+from active3d_pipe.structures import Frame
+
+COUPLED = 20_000  # primitives of one coupling step
+
+
+@dataclass(slots=True)
+class Clock:
+    """Seconds by module, for the journal."""
+
+    seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+
+    @contextmanager
+    def of(self, module: str) -> Iterator[None]:
+        """Add the time spent inside to `module`."""
+        start = time.perf_counter()
+        yield
+        self.seconds[module] += time.perf_counter() - start
+
+
+def unit_rgb(frame: Frame) -> np.ndarray:
+    """(H, W, 3) float32 colour in 0..1."""
+    return frame.rgb.astype(np.float32) * np.float32(1 / 255)
+
+
+def seed(hybrid: HybridMap, frame: Frame, rng: np.random.Generator, clock: Clock) -> int:
+    """Insert primitives where the frame shows surface that the map does not render; returns their number."""
+    settings = hybrid.settings.gaussians
+    room = settings.max_count - len(hybrid.gaussians)
+    if room <= 0:
+        return 0
+    with clock.of("seeding"):
+        view = hybrid.render(frame.camera, frame.T_world_camera) if len(hybrid.gaussians) else None
+        new = seed_frame(
+            unit_rgb(frame), frame.depth, frame.camera, frame.T_world_camera, view, settings, max_new=room, rng=rng
+        )
+        hybrid.gaussians.append(new)
+    return len(new)
+
+
+def train_gaussians(
+    hybrid: HybridMap, frame: Frame, rate: float, clock: Clock, coupling: np.ndarray | None = None
+) -> dict[str, float]:
+    """One iteration of E_photo and depth on one frame; `coupling` is the gradient of E_geo, see `coupling_gradient`."""
+    with clock.of("gaussians"):
+        return optimise_step(
+            hybrid.gaussians, frame.camera, frame.T_world_camera, unit_rgb(frame), frame.depth,
+            hybrid.settings.gaussians, rate, extra_gradient=coupling,
+        )
+
+
+def train_field(
+    hybrid: HybridMap, frames: Sequence[Frame], weights: np.ndarray | None, rng: np.random.Generator, clock: Clock,
+    rate: float = 1.0,
+) -> dict[str, float]:
+    """One iteration of the implicit branch on rays of `frames`."""
+    settings = hybrid.settings.field
+    with clock.of("ray sampling"):
+        batch = sample_rays(frames, settings.rays, rng, weights)
+
+    def add(part: str, seconds: float) -> None:
+        clock.seconds["ray sampling" if part == "sample" else f"field {part}"] += seconds
+
+    return field_step(hybrid.field, hybrid.optimiser, batch, settings, rng, rate, add)
+
+
+def coupling_gradient(hybrid: HybridMap, rng: np.random.Generator, clock: Clock) -> np.ndarray:
+    """(N, 14) gradient of E_geo: means onto the SDF's zero level, shortest axes along its gradient.
+
+    A random share of the primitives takes part at a time, since the field is queried five times for each.
+    """
+    count = len(hybrid.gaussians)
+    with clock.of("coupling"):
+        chosen = np.sort(rng.choice(count, size=min(count, COUPLED), replace=False))
+        means = hybrid.gaussians.means.detach().numpy()[chosen]
+        sdf, normals = hybrid.field.query_sdf(means), hybrid.field.normals(means)
+        # NaN: the others take no part this time.
+        all_sdf = np.full(count, np.nan, np.float32)
+        all_normals = np.zeros((count, 3), np.float32)
+        all_sdf[chosen], all_normals[chosen] = sdf, normals
+        return sdf_gradient(hybrid.gaussians, all_sdf, all_normals, hybrid.settings.gaussians)[1]
+
+
+def add_where_wrong(
+    hybrid: HybridMap, frame: Frame, most: int, rng: np.random.Generator, clock: Clock
+) -> int:
+    """Error-driven adding on one frame; returns the number of new primitives."""
+    settings = hybrid.settings.gaussians
+    most = min(most, settings.max_count - len(hybrid.gaussians))
+    if most <= 0:
+        return 0
+    with clock.of("adding"):
+        view = hybrid.render(frame.camera, frame.T_world_camera)
+        new = error_driven(
+            unit_rgb(frame), frame.depth, frame.camera, frame.T_world_camera, view, settings, max_new=most, rng=rng
+        )
+        hybrid.gaussians.append(new)
+    return len(new)
+
+
+def prune(hybrid: HybridMap, clock: Clock) -> int:
+    """Drop useless primitives; returns how many."""
+    with clock.of("pruning"):
+        drop = prune_mask(hybrid.gaussians, hybrid.settings.gaussians)
+        hybrid.gaussians.keep(~drop)
+    return int(drop.sum())

@@ -1,0 +1,73 @@
+"""The hybrid scene state M_k = {F_theta, G_k} (paper, eq. hybrid_state) with all that a resume needs."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from active3d_pipe.field.optimise import FieldOptimiser
+from active3d_pipe.field.sdf_field import SdfField
+from active3d_pipe.gaussians.parameters import GaussianParameters
+from active3d_pipe.gaussians.rasteriser import RenderedView, render_view
+from active3d_pipe.mapping.config import MappingSettings
+from active3d_pipe.mapping.keyframes import Keyframe
+from active3d_pipe.structures import Camera, GaussianModel
+
+FIELD_MARGIN_M = 0.2  # the field's box reaches beyond the scene's, so that walls at its border have two sides
+OPTIMISER_PREFIXES = ("field.", "gaussians.")
+
+
+class HybridMap:
+    """Both branches, their optimisers' state, and the keyframes. Mutable: only `update_map` and `refine` train it."""
+
+    def __init__(
+        self, field: SdfField, optimiser: FieldOptimiser, gaussians: GaussianParameters, settings: MappingSettings,
+        keyframes: Sequence[Keyframe] = (),
+    ) -> None:
+        self.field = field
+        self.optimiser = optimiser
+        self.gaussians = gaussians
+        self.settings = settings
+        self.keyframes = list(keyframes)
+
+    @classmethod
+    def create(
+        cls, low: np.ndarray, high: np.ndarray, settings: MappingSettings, rng: np.random.Generator
+    ) -> "HybridMap":
+        """An untrained map over the box [low, high] (world, m)."""
+        generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+        margin = FIELD_MARGIN_M
+        field = SdfField(np.asarray(low) - margin, np.asarray(high) + margin, settings.field, generator)
+        gaussians = GaussianParameters.from_model(GaussianModel.empty())
+        return cls(field, FieldOptimiser(field, settings.field), gaussians, settings)
+
+    def render(self, camera: Camera, T_world_camera: np.ndarray) -> RenderedView:
+        """View of the Gaussians: rgb 0..1, depth m (0 where alpha < 0.5), alpha."""
+        return render_view(self.gaussians, camera, T_world_camera, self.settings.gaussians)
+
+    def state(self) -> dict[str, dict[str, np.ndarray]]:
+        """Arrays by table: `field`, `gaussians` (what the map is) and `optimiser` (what training needs)."""
+        gaussians = self.gaussians.state()
+        moments = {f"gaussians.{k}": v for k, v in gaussians.items() if k != "values"}
+        return {
+            "field": self.field.state(),
+            "gaussians": {"values": gaussians["values"]},
+            "optimiser": {**{f"field.{k}": v for k, v in self.optimiser.state().items()}, **moments},
+        }
+
+    @classmethod
+    def from_state(
+        cls, low: np.ndarray, high: np.ndarray, settings: MappingSettings, state: dict[str, dict[str, np.ndarray]],
+        keyframes: Sequence[Keyframe],
+    ) -> "HybridMap":
+        """Inverse of `state`, exact."""
+        hybrid = cls.create(low, high, settings, np.random.default_rng(0))
+        hybrid.field.load_state(state["field"])
+        tables: dict[str, dict[str, np.ndarray]] = {p: {} for p in OPTIMISER_PREFIXES}
+        for name, array in state["optimiser"].items():
+            prefix = next(p for p in OPTIMISER_PREFIXES if name.startswith(p))
+            tables[prefix][name.removeprefix(prefix)] = array
+        hybrid.optimiser.load_state(tables["field."])
+        hybrid.gaussians = GaussianParameters.from_state({**state["gaussians"], **tables["gaussians."]})
+        hybrid.keyframes = list(keyframes)
+        return hybrid

@@ -1,0 +1,65 @@
+"""Final refinement: a stated budget of annealed iterations over everything that was logged."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from active3d_pipe.errors import NumericalError
+from active3d_pipe.mapping import branches
+from active3d_pipe.mapping.hybrid_map import HybridMap
+from active3d_pipe.mapping.update import UpdateReport, round_number
+from active3d_pipe.structures import Frame
+
+FINAL_RATE = 0.1  # learning rates fall to this share, exponentially
+ADD_UNTIL = 0.6  # share of the budget during which primitives are added
+ADD_EVERY = 10
+PRUNE_EVERY = 200
+
+
+def annealed(i: int, iterations: int) -> float:
+    """Learning-rate factor of iteration `i`: from 1 to FINAL_RATE."""
+    return float(FINAL_RATE ** (i / max(iterations - 1, 1)))
+
+
+def refine(
+    hybrid: HybridMap, frames: Sequence[Frame], rng: np.random.Generator, progress: Callable[[str], None]
+) -> UpdateReport:
+    """Optimise both branches over all captured `frames` (not only keyframes), in place.
+
+    Frames are visited in random order, each once before any twice. Held-out views are never seen here.
+    """
+    settings, clock = hybrid.settings, branches.Clock()
+    for i in range(settings.refinement_field_iterations):
+        rate = annealed(i, settings.refinement_field_iterations)
+        branches.train_field(hybrid, frames, None, rng, clock, rate)
+        if i % 20 == 0:
+            progress(f"refining field {i}/{settings.refinement_field_iterations}")
+    total, added, pruned = settings.refinement_iterations, 0, 0
+    room = max(settings.gaussians.max_count - len(hybrid.gaussians), 0)
+    quota = max(1, int(room / max(total * ADD_UNTIL / ADD_EVERY, 1)))
+    coupled = settings.representation == "hybrid"
+    order: list[int] = []
+    scores: list[float] = []
+    for i in range(total):
+        if not order:
+            order = [int(j) for j in rng.permutation(len(frames))]
+        frame = frames[order.pop()]
+        if i % ADD_EVERY == 0 and i < total * ADD_UNTIL:
+            added += branches.add_where_wrong(hybrid, frame, quota, rng, clock)
+        pull = None
+        if coupled and i % settings.coupling_every == settings.coupling_every - 1:
+            pull = branches.coupling_gradient(hybrid, rng, clock)
+        terms = branches.train_gaussians(hybrid, frame, annealed(i, total), clock, pull)
+        if not np.isfinite(terms["loss"]):
+            raise NumericalError(f"refinement: the loss is not finite in iteration {i}; lower the learning rates")
+        scores.append(terms["psnr"])
+        if i % PRUNE_EVERY == PRUNE_EVERY - 1:
+            pruned += branches.prune(hybrid, clock)
+        if i % 20 == 0:
+            progress(f"refining Gaussians {i}/{total}")
+    last = scores[-min(len(scores), len(frames)) :]
+    numbers = {
+        "frames": len(frames), "iterations": total, "gaussians": len(hybrid.gaussians), "added": added,
+        "pruned": pruned, "psnr_train": round_number(float(np.mean(last))) if last else None,
+    }
+    return UpdateReport(numbers, dict(clock.seconds))

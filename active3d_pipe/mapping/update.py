@@ -1,0 +1,122 @@
+"""One round of mapping: fold new frames into the hybrid map. The paper's mapping algorithm on one page."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from active3d_pipe.errors import NumericalError
+from active3d_pipe.mapping import branches
+from active3d_pipe.mapping.config import MappingSettings
+from active3d_pipe.mapping.hybrid_map import HybridMap
+from active3d_pipe.mapping.keyframes import select_keyframes
+from active3d_pipe.mapping.window import choose_window, draw_keyframe
+from active3d_pipe.structures import Frame, UncertaintyVolume
+
+PRUNE_EVERY = 100  # iterations
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateReport:
+    """`numbers`: deterministic facts for the record; `seconds`: wall time by module."""
+
+    numbers: dict[str, Any]
+    seconds: dict[str, float]
+
+
+def update_map(
+    hybrid: HybridMap, frames: Sequence[Frame], volume: UncertaintyVolume | None, round: int,
+    settings: MappingSettings, rng: np.random.Generator, progress: Callable[[str], None],
+) -> UpdateReport:
+    """Fold the frames of a round into `hybrid`, in place.
+
+    Args:
+        hybrid: the map M_{k-1}; becomes M_k.
+        frames: the round's frames in order of capture.
+        volume: uncertainty volume of the round before, None in the first: it decides on keyframes.
+        round: k.
+        settings: the mapping section.
+        rng: every random choice.
+        progress: called with a short text now and then.
+
+    Raises:
+        NumericalError: a loss became NaN or infinite.
+    """
+    clock = branches.Clock()
+    with clock.of("keyframes"):
+        new = select_keyframes(frames, hybrid.keyframes, volume, round, settings.keyframes)
+        hybrid.keyframes += new
+        window = choose_window(hybrid.keyframes, new, settings.window)
+
+    factor = settings.first_round_factor if round == 0 else 1.0
+    iterations = round_up(factor * settings.field_iterations_per_step * len(frames))
+    field_loss = _field(hybrid, len(new), iterations, rng, clock)
+    progress("field trained")
+
+    seeded = sum(branches.seed(hybrid, k.frame, rng, clock) for k in new)
+    iterations = round_up(factor * settings.gaussian_iterations_per_step * len(frames))
+    psnr, added, pruned = _gaussians(hybrid, window, iterations, rng, clock, progress)
+
+    numbers = {
+        "keyframes": len(hybrid.keyframes), "new_keyframes": len(new), "window": len(window),
+        "gaussians": len(hybrid.gaussians), "seeded": seeded, "added": added, "pruned": pruned,
+        "psnr_window": round_number(psnr), "field_loss": round_number(field_loss),
+    }
+    return UpdateReport(numbers, dict(clock.seconds))
+
+
+def round_up(x: float) -> int:
+    """Number of iterations for a real-valued budget."""
+    return int(np.ceil(x))
+
+
+def round_number(x: float) -> float:
+    """Six significant decimals: what a record keeps."""
+    return float(np.round(x, 6))
+
+
+def _field(hybrid: HybridMap, num_new: int, iterations: int, rng: np.random.Generator, clock: branches.Clock) -> float:
+    """Train the implicit branch: half of the rays from the new keyframes, half from all."""
+    frames = [k.frame for k in hybrid.keyframes]
+    weights = np.full(len(frames), 1.0 / len(frames))
+    if 0 < num_new < len(frames):
+        weights *= 0.5
+        weights[-num_new:] += 0.5 / num_new
+    loss = 0.0
+    for _ in range(iterations):
+        loss = branches.train_field(hybrid, frames, weights, rng, clock)["total"]
+    return loss
+
+
+def _gaussians(
+    hybrid: HybridMap, window: Sequence[int], iterations: int, rng: np.random.Generator, clock: branches.Clock,
+    progress: Callable[[str], None],
+) -> tuple[float, int, int]:
+    """Train the explicit branch over the window; returns (mean PSNR of the last pass, added, pruned)."""
+    settings = hybrid.settings
+    coupled = settings.representation == "hybrid"
+    scores: list[float] = []
+    added = pruned = 0
+    # Adding looks at every frame of the window once, in the first two thirds, so that what is new still settles.
+    adding = {int(i * iterations * 0.66 / max(len(window), 1)): index for i, index in enumerate(window)}
+    for i in range(iterations):
+        if i in adding:
+            frame = hybrid.keyframes[adding[i]].frame
+            added += branches.add_where_wrong(hybrid, frame, settings.add_per_round // len(window), rng, clock)
+        index = draw_keyframe(rng, window, len(hybrid.keyframes), settings.window.replay)
+        pull = None
+        if coupled and i % settings.coupling_every == settings.coupling_every - 1:
+            pull = branches.coupling_gradient(hybrid, rng, clock)
+        frame = hybrid.keyframes[index].frame
+        terms = branches.train_gaussians(hybrid, frame, settings.learning_rate_scale, clock, pull)
+        if not np.isfinite(terms["loss"]):
+            raise NumericalError(f"gaussians: the loss is not finite in iteration {i}; lower the learning rates")
+        scores.append(terms["psnr"])
+        if i % PRUNE_EVERY == PRUNE_EVERY - 1:
+            pruned += branches.prune(hybrid, clock)
+        if i % 20 == 0:
+            progress(f"gaussians {i}/{iterations}")
+    pruned += branches.prune(hybrid, clock)
+    last = scores[-min(len(scores), 2 * len(window)) :]
+    return (float(np.mean(last)) if last else 0.0), added, pruned

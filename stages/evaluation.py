@@ -1,0 +1,160 @@
+"""Evaluation: the only stage beside capture that knows the ground truth."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from active3d_pipe.pipeline.stage import NodeId, Stage, StageContext
+from stages import shared
+
+if TYPE_CHECKING:
+    from active3d_pipe.evaluation.views import ViewScores
+    from active3d_pipe.structures import TriangleMesh
+
+CURVE_ROUNDS = 16  # rounds whose surfaces are measured for the curves over steps
+
+
+def _inputs(last_round: int) -> tuple[NodeId, ...]:
+    surfaces = tuple(NodeId("uncertainty", k) for k in shared.spread(range(last_round + 1), CURVE_ROUNDS))
+    return (*shared.captures(last_round), *surfaces, NodeId("export"))
+
+
+def _parameters(config: Any, inputs: Mapping[NodeId, Path]) -> dict[str, Any]:
+    from active3d_pipe.sim.digest import source_digest
+
+    return {"scene": source_digest(config.scene.file)}
+
+
+def _run(context: StageContext) -> None:
+    import numpy as np
+    from active3d_pipe.sim.observable import observable_points
+
+    from active3d_pipe.evaluation import evaluate as ev
+    from active3d_pipe.evaluation.culling import SeenBy
+    from active3d_pipe.evaluation.geometry_metrics import prepare_truth
+    from active3d_pipe.storage import meshes
+    from active3d_pipe.storage.files import write_json
+    from active3d_pipe.structures import TriangleMesh
+
+    config = context.config
+    settings = config.evaluation
+    simulator = shared.make_simulator(config, config.run.seed)
+    frames = [f for k in range(context.last_round + 1) for f in shared.load_frames(context.input("capture", k))]
+    hybrid = shared.load_map(context.input("export"), context.inputs, config)
+    mesh = meshes.read_mesh(context.input("export") / "mesh.ply")
+
+    context.progress("ground truth")
+    scene = simulator.scene
+    truth_mesh = TriangleMesh(scene.vertices.astype(np.float32), scene.faces.astype(np.int32))
+
+    def observable(points: np.ndarray) -> np.ndarray:
+        return observable_points(simulator, points)
+
+    truth = prepare_truth(truth_mesh, settings, observable)
+    context.progress("geometry")
+    culling = frames[:: settings.cull_stride]
+    seen_by = SeenBy(frames[0].camera, np.stack([f.T_world_camera for f in culling]), [f.depth for f in culling])
+    metrics = ev.evaluate_geometry(mesh, truth, settings, seen_by=seen_by, query_sdf=hybrid.field.query_sdf)
+
+    def render(camera: Any, T: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        view = hybrid.render(camera, T)
+        return view.rgb, view.depth, view.alpha
+
+    sets = _view_sets(simulator, frames, settings)
+    scores, lpips_source = ev.evaluate_views(
+        render, sets, settings, lambda name, done, total: context.progress(f"{name} views {done}/{total}")
+    )
+    metrics |= ev.view_metrics(scores)
+    metrics |= _run_metrics(context, frames)
+    _write_examples(context.out / "examples", render, sets, scores, settings.example_views)
+
+    curves = _curves(context, truth_mesh, observable) if settings.curve_points else []
+    write_json(context.out / "curves.json", curves)
+    (context.out / "curves.csv").write_text(ev.rows_to_csv(curves), encoding="utf-8")
+    rows = ev.summary_rows(metrics)
+    document = {"schema": "active3d.metrics/1", "lpips": lpips_source, "metrics": metrics}
+    write_json(context.out / "metrics.json", document)
+    write_json(context.out / "views.json", {name: s.rows for name, s in scores.items()})
+    (context.out / "metrics.csv").write_text(ev.rows_to_csv(rows), encoding="utf-8")
+    (context.out / "views.csv").write_text(
+        ev.rows_to_csv([{"set": name, **row} for name, s in scores.items() for row in s.rows]), encoding="utf-8"
+    )
+    headline = (
+        "completion_ratio_surface", "completion_ratio_surface_observable", "accuracy_cm_surface",
+        "completion_cm_surface", "precision_surface", "psnr", "ssim", "lpips", "psnr_gap", "mad_cm", "collisions",
+    )
+    context.notes.update({k: metrics[k] for k in headline if metrics.get(k) is not None})
+
+
+def _curves(context: StageContext, truth_mesh: "TriangleMesh", observable: Any) -> list[dict[str, Any]]:
+    """Completion and accuracy of the surface of every sampled round."""
+    from active3d_pipe.evaluation import evaluate as ev
+    from active3d_pipe.evaluation.geometry_metrics import prepare_truth
+    from active3d_pipe.storage import meshes
+    from active3d_pipe.storage.files import read_json
+
+    settings = context.config.evaluation
+    truth = prepare_truth(truth_mesh, ev.curve_settings(settings), observable, floors=False)
+    points = []
+    for node, folder in context.inputs.items():
+        if node.stage == "uncertainty" and node.round is not None:
+            steps = read_json(context.input("capture", node.round) / shared.CAPTURE_NAME)["steps_total"]
+            surface = meshes.read_mesh(folder / shared.SURFACE_NAME)
+            if len(surface.faces):
+                points.append({"round": node.round, **ev.curve_point(steps, surface, truth, settings)})
+            context.progress(f"curve at round {node.round}")
+    return points
+
+
+def _view_sets(simulator: Any, frames: list, settings: Any) -> dict[str, list]:
+    """Held-out views at random free poses, the circle protocol, and a sample of the captured frames."""
+    from active3d_pipe.sim.observable import held_out_poses
+
+    from active3d_pipe.evaluation.views import circle_poses
+
+    scene = simulator.scene
+    held_out = held_out_poses(simulator, settings.num_views, scene.name, min_clearance_m=settings.view_clearance_m)
+    circle = circle_poses(scene.start_pose[:3, 3], settings.circle_radius_m, settings.circle_views)
+    circle = circle[simulator.clearance(circle[:, :3, 3]) >= settings.view_clearance_m]
+    return {
+        "heldout": [simulator.render(T, step=i) for i, T in enumerate(held_out)],
+        "circle": [simulator.render(T, step=i) for i, T in enumerate(circle)],
+        "train": shared.spread(frames, settings.train_views) if settings.train_views else [],
+    }
+
+
+def _run_metrics(context: StageContext, frames: list) -> dict[str, Any]:
+    from active3d_pipe.storage.files import read_json
+
+    logs = [read_json(context.input("capture", k) / shared.CAPTURE_NAME) for k in range(context.last_round + 1)]
+    return {
+        "steps": len(frames), "rounds": context.last_round + 1,
+        "collisions": sum(d["collisions"] for d in logs),
+        "path_m": round(sum(d["path_length_m"] for d in logs), 3),
+        "min_clearance_m": min(d["min_clearance_m"] for d in logs),
+    }
+
+
+def _write_examples(folder: Path, render: Any, sets: dict, scores: "dict[str, ViewScores]", count: int) -> None:
+    """A few held-out views as images (worst to best), for the report."""
+    import numpy as np
+
+    from active3d_pipe.evaluation.views import pick_examples, view_images
+    from active3d_pipe.storage.files import write_tensors
+
+    if "heldout" not in scores:
+        return
+    folder.mkdir()
+    for index in pick_examples(scores["heldout"].rows, count):
+        images = view_images(render, sets["heldout"][index], index)
+        tensors = {
+            "truth_rgb": images.truth_rgb, "render_rgb": images.render_rgb,
+            "truth_depth": images.truth_depth.astype(np.float32), "render_depth": images.render_depth,
+        }
+        write_tensors(folder / f"view_{index:04d}.safetensors", tensors, {"index": index, "psnr": images.psnr})
+
+
+STAGE = Stage(
+    name="evaluation", version=1, config=("evaluation", "scene", "camera", "sensor", "mapping", "run.seed"),
+    inputs=_inputs, run=_run, loop=False, parameters=_parameters,
+)

@@ -1,0 +1,50 @@
+"""Export: refine the final map over everything that was logged, and hand over mesh and Gaussians."""
+
+from active3d_pipe.pipeline.stage import NodeId, Stage, StageContext
+from stages import shared
+
+MAX_FRAMES = 700  # logged frames that refinement and culling use, evenly spread: bounds the memory of long runs
+
+
+def _inputs(last_round: int) -> tuple[NodeId, ...]:
+    return (*shared.captures(last_round), NodeId("mapping", last_round), NodeId("uncertainty", last_round))
+
+
+def _run(context: StageContext) -> None:
+    import time
+
+    from active3d_pipe.export.isosurface import colour_mesh, cull_unseen, extract_mesh, near_surface
+    from active3d_pipe.mapping.refine import refine
+    from active3d_pipe.storage import meshes, splats, volumes
+    from active3d_pipe.storage.files import write_json
+
+    config, last = context.config, context.last_round
+    hybrid = shared.load_map(context.input("mapping", last), context.inputs, config)
+    volume = volumes.read_volume(context.input("uncertainty", last) / shared.VOLUME_NAME)
+    frames = [f for k in range(last + 1) for f in shared.load_frames(context.input("capture", k))]
+    frames = shared.spread(frames, MAX_FRAMES)
+    report = refine(hybrid, frames, context.rng("refinement"), context.progress)
+    context.timings.update(report.seconds)
+
+    start = time.perf_counter()
+    context.progress("extracting the mesh")
+    settings = config.export.mesh
+    observed = near_surface(volume["hit_evidence"], settings.dilate_voxels)
+    grid, field = volume.grid, hybrid.field
+    mesh = extract_mesh(field.query_sdf, field.low, field.high, settings, grid=grid, observed=observed)
+    mesh = cull_unseen(mesh, frames, settings)
+    mesh = colour_mesh(mesh, field.query_color)
+    context.timings["mesh"] = time.perf_counter() - start
+
+    shared.save_map(context.out, hybrid)
+    meshes.write_mesh_ply(context.out / "mesh.ply", mesh)
+    if config.export.glb:
+        meshes.write_mesh_glb(context.out / "mesh.glb", mesh)
+    splats.write_splats(context.out / "gaussians.ply", hybrid.gaussians.to_model())
+    numbers = {**report.numbers, "vertices": len(mesh.vertices), "faces": len(mesh.faces)}
+    numbers["mesh_area_m2"] = round(mesh.area_m2, 3)
+    write_json(context.out / "export.json", {"schema": "active3d.export/1", **numbers})
+    context.notes.update(numbers)
+
+
+STAGE = Stage(name="export", version=1, config=("mapping", "export"), inputs=_inputs, run=_run, loop=False)
