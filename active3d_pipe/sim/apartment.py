@@ -4,7 +4,6 @@ Nothing is loaded: geometry and textures are procedural, so a scene is free of a
 them. World frame: metres, Z up, floor at z = 0, the floor plan centred on the origin.
 """
 
-import math
 import zlib
 from dataclasses import dataclass
 from typing import Any
@@ -15,16 +14,17 @@ from PIL import Image
 from trimesh.visual.material import PBRMaterial
 
 from active3d_pipe.errors import ConfigError
+from active3d_pipe.geometry.raycasting import SurfaceIndex
 from active3d_pipe.sim.apartment_furnishing import Furnisher
 from active3d_pipe.sim.apartment_layout import Room, make_layout
 from active3d_pipe.sim.apartment_look import make_look, make_shared
 from active3d_pipe.sim.apartment_mesh import Material, MeshBuilder
 from active3d_pipe.sim.apartment_placement import Floor
 from active3d_pipe.sim.apartment_shell import build_outer_shell, build_room_shell
+from active3d_pipe.sim.apartment_textures import HUES
 
 START_HEIGHT = 1.3  # m
 MAX_ROOMS = 8
-GOLDEN = 0.618034  # hues of successive rooms, as far apart as can be
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,10 +156,10 @@ def make_apartment(rooms: int, seed: int, *, detail: float = 1.0) -> Apartment:
     layout = make_layout(rooms, rng)
     shared = make_shared(rng)
     builder = MeshBuilder(np.random.default_rng([seed, rooms, 1]), detail)
-    hue = float(rng.random())
+    hues = rng.permutation(HUES)
     floors = []
     for k, room in enumerate(layout):
-        look = make_look(room.kind, f"{k}", hue + k * GOLDEN, shared, rng)
+        look = make_look(room.kind, f"{k}", float(hues[k]), shared, rng)
         build_room_shell(builder, k, room, look, int(rng.integers(4)), rng)
         furnisher = Furnisher(builder, room, look, rng, 4 * k)
         furnisher.furnish()
@@ -171,18 +171,24 @@ def make_apartment(rooms: int, seed: int, *, detail: float = 1.0) -> Apartment:
         for _, part in sorted(builder.parts.items())
     )
     living = next(f for f in floors if f.room.kind == "living")
-    return Apartment(rooms, seed, detail, tuple(layout), surfaces, _start(living))
+    return Apartment(rooms, seed, detail, tuple(layout), surfaces, _start(living, surfaces))
 
 
-def _start(floor: Floor) -> tuple[np.ndarray, np.ndarray]:
+def _start(floor: Floor, surfaces: tuple[Surface, ...]) -> tuple[np.ndarray, np.ndarray]:
     """A first view: from a roomy place as far to the side as possible, across the room."""
-    distance = floor.clearance()
+    index = SurfaceIndex(
+        np.concatenate([s.vertices[s.faces].reshape(-1, 3) for s in surfaces]),
+        np.arange(3 * sum(len(s.faces) for s in surfaces)).reshape(-1, 3))
+    region = floor.region(floor.blocked)
+    reach = np.ones_like(floor.blocked) if region is None else region
+    cells = np.stack([*np.meshgrid(floor.xs, floor.ys, indexing="ij"), np.full(reach.shape, START_HEIGHT)], -1)
+    distance = np.zeros(reach.shape)
+    distance[reach] = index.distance(cells[reach])
     x0, y0, x1, y1 = floor.room.inner
     cx, cy = (x0 + x1) / 2, (y0 + y1) / 2
-    x, y = np.meshgrid(floor.xs, floor.ys, indexing="ij")
-    score = np.where(distance >= min(0.5, float(distance.max())), np.hypot(x - cx, y - cy), -1.0)
+    away = np.hypot(cells[..., 0] - cx, cells[..., 1] - cy)
+    score = np.where(distance >= min(0.45, float(distance.max())), away, -1.0)
     i, j = np.unravel_index(int(np.argmax(score)), score.shape)
-    position = np.array([x[i, j], y[i, j], START_HEIGHT])
-    away = math.hypot(cx - position[0], cy - position[1])
-    target = np.array([cx, cy, 1.1]) if away > 0.2 else np.array([x1, y1, 1.1])
+    position = cells[i, j]
+    target = np.array([cx, cy, 1.1]) if away[i, j] > 0.2 else np.array([x1, y1, 1.1])
     return position, target

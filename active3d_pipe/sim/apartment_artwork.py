@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from active3d_pipe.sim.apartment_textures import Colour, blend, coordinates, noise, ramp, shade, smooth
+from active3d_pipe.sim.apartment_textures import Colour, blend, coordinates, noise, pick_hue, ramp, shade, smooth
 
 SPINES = (4, 24)  # rows and columns of the atlas of book spines
 PAINTINGS = (3, 3)
@@ -51,7 +51,7 @@ def spines(rng: np.random.Generator, n: int) -> np.ndarray:
     for k in range(rows * cols):
         row, col = divmod(k, cols)
         r0, r1, c0, c1 = row * n // rows, (row + 1) * n // rows, col * n // cols, (col + 1) * n // cols
-        base = _hsv(rng.random(), rng.uniform(0.1, 0.75), rng.uniform(0.25, 0.92))
+        base = _hsv(pick_hue(rng), rng.uniform(0.08, 0.7), rng.uniform(0.22, 0.9))
         cell = image[r0:r1, c0:c1]
         cell[:] = base
         h, w = r1 - r0, c1 - c0
@@ -60,7 +60,7 @@ def spines(rng: np.random.Generator, n: int) -> np.ndarray:
             cell[int(at * h) : int(at * h) + int(rng.integers(1, 5))] = ink
         if rng.random() < 0.4:
             a = rng.uniform(0.1, 0.5)
-            cell[int(a * h) : int((a + 0.2) * h)] = _hsv(rng.random(), 0.5, rng.uniform(0.3, 0.9))
+            cell[int(a * h) : int((a + 0.2) * h)] = _hsv(pick_hue(rng), 0.5, rng.uniform(0.3, 0.9))
         upright = np.ascontiguousarray(np.rot90(cell))  # titles run along the spine
         size = max(2, int(w * rng.uniform(0.2, 0.4)))
         _text(rng, upright, (int(w * 0.25), int(w * 0.85), int(h * 0.1), int(h * 0.75)), ink, height=size)
@@ -125,7 +125,7 @@ def view(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 def _abstract(rng: np.random.Generator, n: int) -> np.ndarray:
-    hues = rng.random() + np.array([0, 0.08, 0.5, 0.56, 0.3])
+    hues = pick_hue(rng) + np.array([0, 0.06, 0.5, 0.54, 0.1])
     image = np.broadcast_to(_hsv(hues[0] % 1, 0.15, 0.93), (n, n, 3))
     for k in range(6):
         colour = _hsv(hues[k % 5] % 1, rng.uniform(0.4, 0.9), rng.uniform(0.3, 0.95))
@@ -136,9 +136,9 @@ def _abstract(rng: np.random.Generator, n: int) -> np.ndarray:
 def _geometric(rng: np.random.Generator, n: int) -> np.ndarray:
     u, v = coordinates(n)
     image = np.broadcast_to(np.asarray((0.93, 0.89, 0.8), np.float32), (n, n, 3)).copy()
-    hue = rng.random()
+    hue = pick_hue(rng)
     for _ in range(9):
-        colour = _hsv((hue + rng.choice([0, 0.07, 0.45, 0.6])) % 1, rng.uniform(0.3, 0.9), rng.uniform(0.25, 0.95))
+        colour = _hsv((hue + float(rng.choice([0, 0.06, 0.5, 0.55]))) % 1, rng.uniform(0.3, 0.9), rng.uniform(0.25, 0.95))
         cx, cy, r = rng.random(), rng.random(), rng.uniform(0.08, 0.3)
         kind = rng.integers(3)
         if kind == 0:
@@ -153,16 +153,18 @@ def _geometric(rng: np.random.Generator, n: int) -> np.ndarray:
 
 def _bouquet(rng: np.random.Generator, n: int) -> np.ndarray:
     u, v = coordinates(n)
-    image = ramp(np.clip(0.5 + 0.2 * noise(rng, n, 1.7) + 0.4 * (v - 0.5), 0, 1), _hsv(rng.random(), 0.35, 0.22), _hsv(rng.random(), 0.3, 0.55))
+    image = ramp(np.clip(0.5 + 0.2 * noise(rng, n, 1.7) + 0.4 * (v - 0.5), 0, 1), _hsv(pick_hue(rng), 0.35, 0.22), _hsv(pick_hue(rng), 0.3, 0.55))
     vase = (np.abs(u - 0.5) < 0.09 + 0.05 * np.sin(9 * v)) & (v > 0.62) & (v < 0.93)
-    image[vase] = _hsv(rng.random(), 0.3, 0.75)
+    image[vase] = _hsv(pick_hue(rng), 0.3, 0.75)
     for _ in range(26):
         cx, cy, r = rng.normal(0.5, 0.16), rng.normal(0.38, 0.12), rng.uniform(0.03, 0.09)
-        a, d = np.arctan2(v - cy, u - cx), np.hypot(u - cx, v - cy) / r
-        petal = 0.75 + 0.25 * np.cos(rng.integers(4, 8) * a)
-        colour = _hsv(rng.choice([0.0, 0.05, 0.12, 0.3, 0.33, 0.9]), rng.uniform(0.4, 0.85), rng.uniform(0.5, 0.97))
-        image = blend(image, colour, smooth(0, 0.1, petal - d) * (0.65 + 0.35 * np.clip(d, 0, 1)))
-        image = blend(image, colour * 0.4, smooth(0, 0.1, 0.25 - d))
+        petals = int(rng.integers(4, 8))
+        colour = _hsv(float(rng.choice([0.0, 0.05, 0.12, 0.3, 0.33, 0.95])), rng.uniform(0.4, 0.85), rng.uniform(0.5, 0.97))
+        window = (slice(max(0, int((cy - r) * n)), max(0, int((cy + r) * n) + 1)), slice(max(0, int((cx - r) * n)), max(0, int((cx + r) * n) + 1)))
+        du, dv = u[window] - cx, v[window] - cy
+        a, d = np.arctan2(dv, du), np.hypot(du, dv) / r
+        flower = blend(image[window], colour, smooth(0, 0.1, 0.75 + 0.25 * np.cos(petals * a) - d) * (0.65 + 0.35 * np.clip(d, 0, 1)))
+        image[window] = blend(flower, colour * 0.4, smooth(0, 0.1, 0.25 - d))
     return shade(image, 1 + 0.08 * noise(rng, n, 0.6, stretch=(3, 1), low=8))
 
 
@@ -229,7 +231,7 @@ def labels(rng: np.random.Generator, n: int) -> np.ndarray:
     for k in range(rows * cols):
         row, col = divmod(k, cols)
         cell = image[row * m : (row + 1) * m, col * m : (col + 1) * m]
-        hue = rng.random()
+        hue = pick_hue(rng)
         cell[:] = _hsv(hue, rng.uniform(0.2, 0.8), rng.uniform(0.5, 0.95))
         motif: Sequence = (_bouquet, _abstract, _geometric)
         size = int(m * rng.uniform(0.45, 0.7))

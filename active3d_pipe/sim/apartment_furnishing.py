@@ -257,7 +257,7 @@ class Furnisher:
     def corners(self, kinds: tuple[str, ...]) -> None:
         """Plants and baskets against the walls, corners first."""
         for kind in kinds:
-            size = 0.5 if kind == "plant" else 0.36
+            size = 0.6 if kind == "plant" else 0.36
             height = 1.3 if kind == "plant" else 0.4
             spot = self.floor.wall(size, size, height, prefer="corner", gap=0.12 if kind == "plant" else 0.02)
             if spot is None:

@@ -71,7 +71,7 @@ class Look:
 def make_shared(rng: np.random.Generator) -> Shared:
     """Draw the shared materials."""
     dark, light = WOODS[int(rng.integers(len(WOODS)))]
-    hue = rng.random()
+    hue = tex.pick_hue(rng)
     door = (
         Material("door", partial(tex.wood, dark=dark, light=light), 1.28, grain=True)
         if rng.random() < 0.5
@@ -79,9 +79,9 @@ def make_shared(rng: np.random.Generator) -> Shared:
     )
     vases = tuple(
         Material(f"vase_{k}", partial(
-            tex.glaze, colour=hsv(rng.random(), rng.uniform(0.05, 0.35), rng.uniform(0.7, 0.92)),
-            second=hsv(rng.random(), rng.uniform(0.4, 0.8), rng.uniform(0.3, 0.75)), bands=int(rng.integers(4, 14))), 0.64, 256)
-        for k in range(4)
+            tex.glaze, colour=hsv(tex.pick_hue(rng), rng.uniform(0.05, 0.5), rng.uniform(0.6, 0.92)),
+            second=hsv(tex.pick_hue(rng), rng.uniform(0.3, 0.7), rng.uniform(0.35, 0.75)), bands=int(rng.integers(2, 14))), 0.64, 256)
+        for k in range(5)
     )
     return Shared(
         ceiling=Material("ceiling", partial(tex.plaster, colour=(0.90, 0.89, 0.86), strength=1.2), 2.56, 1024),
@@ -129,8 +129,8 @@ def _floor(kind: str, tag: str, hue: float, rng: np.random.Generator) -> Materia
 
 def _walls(kind: str, tag: str, hue: float, rng: np.random.Generator) -> tuple[Material, Material]:
     ground = hsv(hue, rng.uniform(0.06, 0.2), rng.uniform(0.8, 0.92))
-    figure = hsv(hue + rng.uniform(-0.06, 0.06), rng.uniform(0.2, 0.4), rng.uniform(0.6, 0.78))
-    accent = hsv(hue + rng.choice([0.45, 0.1, -0.12]), rng.uniform(0.35, 0.55), rng.uniform(0.55, 0.75))
+    figure = hsv(hue + rng.uniform(-0.04, 0.04), rng.uniform(0.2, 0.38), rng.uniform(0.6, 0.78))
+    accent = hsv(tex.pick_hue(rng), rng.uniform(0.3, 0.5), rng.uniform(0.55, 0.75))
     if kind == "bath":
         layout = str(rng.choice(["brick", "mosaic", "square"]))
         wall = partial(tex.tiles, face=ground, other=figure, grout=(0.86, 0.86, 0.84), count=16 if layout != "mosaic" else 14,
@@ -144,7 +144,7 @@ def _walls(kind: str, tag: str, hue: float, rng: np.random.Generator) -> tuple[M
     plain = partial(tex.plaster, colour=ground, strength=1.5)
     papered = Material(f"accent_{tag}", paper, 2.56, 1024)
     if kind != "kitchen" and rng.random() < 0.45:
-        return papered, Material(f"wall_{tag}", partial(tex.plaster, colour=hsv(hue, 0.35, 0.7), strength=1.5), 2.56, 1024)
+        return papered, Material(f"wall_{tag}", partial(tex.plaster, colour=hsv(hue, 0.28, 0.74), strength=1.5), 2.56, 1024)
     return Material(f"wall_{tag}", plain, 2.56, 1024), papered
 
 
@@ -155,11 +155,11 @@ def make_look(kind: str, tag: str, hue: float, shared: Shared, rng: np.random.Ge
     patterns: Sequence[str] = [str(p) for p in rng.permutation(["stripes", "plaid", "dots", "zigzag"])]
 
     def cloth(name: str, pattern: str, h: float, s: float, v: float) -> Material:
-        light = hsv(h + rng.choice([0.0, 0.08, 0.5]), rng.uniform(0.08, 0.3), rng.uniform(0.75, 0.92))
+        light = hsv(h if rng.random() < 0.5 else tex.pick_hue(rng), rng.uniform(0.08, 0.3), rng.uniform(0.75, 0.92))
         return Material(f"{name}_{tag}", partial(
             tex.weave, colour=hsv(h, s, v), second=light, pattern=pattern), 0.768)
 
-    warm = hue + float(rng.choice([0.42, 0.5, 0.58, 0.1]))
+    warm = max((tex.pick_hue(rng) for _ in range(3)), key=lambda h: min(abs(h - hue) % 1, 1 - abs(h - hue) % 1))
     sofa = (
         Material(f"fabric_{tag}", partial(tex.leather, colour=hsv(rng.uniform(0.02, 0.08), 0.6, rng.uniform(0.3, 0.6))), 1.28)
         if kind in ("living", "study") and rng.random() < 0.3
@@ -167,7 +167,7 @@ def make_look(kind: str, tag: str, hue: float, shared: Shared, rng: np.random.Ge
     )
     rug = partial(
         art.rug, ground=hsv(warm, rng.uniform(0.4, 0.65), rng.uniform(0.35, 0.6)),
-        figure=hsv(hue + 0.08, rng.uniform(0.3, 0.5), rng.uniform(0.3, 0.5)), accent=hsv(0.11, 0.35, 0.84))
+        figure=hsv(tex.pick_hue(rng), rng.uniform(0.3, 0.5), rng.uniform(0.3, 0.5)), accent=hsv(0.11, 0.35, 0.84))
     return Look(
         shared=shared,
         floor=_floor(kind, tag, hue, rng),
@@ -176,11 +176,11 @@ def make_look(kind: str, tag: str, hue: float, shared: Shared, rng: np.random.Ge
         wood=Material(f"wood_{tag}", partial(tex.wood, dark=WOODS[first][0], light=WOODS[first][1]), 1.28, grain=True),
         wood2=Material(f"wood2_{tag}", partial(tex.wood, dark=WOODS[second][0], light=WOODS[second][1]), 1.28, grain=True),
         paint=Material(f"paint_{tag}", partial(
-            tex.lacquer, colour=hsv(hue + rng.choice([0.0, 0.5]), rng.uniform(0.1, 0.45), rng.uniform(0.55, 0.88))), 1.28, grain=True),
+            tex.lacquer, colour=hsv(hue if rng.random() < 0.5 else warm, rng.uniform(0.08, 0.4), rng.uniform(0.55, 0.88))), 1.28, grain=True),
         fabric=sofa,
         fabric2=cloth("fabric2", patterns[0], hue + 0.03, rng.uniform(0.35, 0.6), rng.uniform(0.4, 0.7)),
-        fabric3=cloth("fabric3", patterns[1], warm + 0.1, rng.uniform(0.35, 0.65), rng.uniform(0.45, 0.75)),
-        curtain=cloth("curtain", patterns[2], hue + rng.choice([0.0, 0.5]), rng.uniform(0.2, 0.5), rng.uniform(0.5, 0.75)),
+        fabric3=cloth("fabric3", patterns[1], tex.pick_hue(rng), rng.uniform(0.35, 0.65), rng.uniform(0.45, 0.75)),
+        curtain=cloth("curtain", patterns[2], hue if rng.random() < 0.4 else warm, rng.uniform(0.2, 0.45), rng.uniform(0.5, 0.75)),
         rug=Material(f"rug_{tag}", rug, 1.0, 768),
         shade=cloth("shade", "plain", 0.11, 0.18, 0.92),
     )

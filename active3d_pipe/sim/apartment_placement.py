@@ -79,8 +79,8 @@ class Floor:
         """Distance of every cell to furniture or walls, m."""
         return ndimage.distance_transform_edt(~np.pad(self.blocked if blocked is None else blocked, 1, constant_values=True))[1:-1, 1:-1] * CELL
 
-    def walkable(self, blocked: np.ndarray) -> bool:
-        """Whether an agent still gets from every door to every other and to a roomy place."""
+    def region(self, blocked: np.ndarray) -> np.ndarray | None:
+        """Cells from which an agent gets to every door and to a roomy place; None if there are none."""
         distance = self.clearance(blocked)
         regions, _ = ndimage.label(distance > AGENT)
         roomy = np.unique(regions[distance > ROOMY])
@@ -89,14 +89,17 @@ class Floor:
             i = int(np.clip((x - self.xs[0]) / CELL + 0.5, 0, len(self.xs) - 1))
             j = int(np.clip((y - self.ys[0]) / CELL + 0.5, 0, len(self.ys) - 1))
             allowed &= {int(regions[i, j])}
-        return any(np.count_nonzero(regions == k) * CELL**2 > 1.2 for k in allowed)
+        for k in sorted(allowed, key=lambda k: -np.count_nonzero(regions == k)):
+            if np.count_nonzero(regions == k) * CELL**2 > 1.2:
+                return regions == k
+        return None
 
     def take(self, spot: Spot, width: float, depth: float, *, margin: float = 0.02) -> bool:
         """Claim a footprint if it is free and leaves the floor connected."""
         if not self.inside(spot, width, depth):
             return False
         mask = self.mask(spot, width, depth, margin)
-        if (mask & (self.blocked | self.keep)).any() or not self.walkable(self.blocked | mask):
+        if (mask & (self.blocked | self.keep)).any() or self.region(self.blocked | mask) is None:
             return False
         self.blocked |= mask
         return True

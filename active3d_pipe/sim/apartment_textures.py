@@ -11,6 +11,14 @@ from scipy import fft
 
 Colour = Sequence[float] | np.ndarray
 
+# Hues that go together in a home: brick, terracotta, sand, ochre, olive, sage, teal, petrol, slate, navy, dusty rose.
+HUES = (0.01, 0.045, 0.085, 0.12, 0.19, 0.33, 0.47, 0.53, 0.58, 0.62, 0.965)
+
+
+def pick_hue(rng: np.random.Generator) -> float:
+    """One of HUES, a little moved."""
+    return float(HUES[int(rng.integers(len(HUES)))] + rng.normal(0, 0.012)) % 1.0
+
 
 def noise(
     rng: np.random.Generator, n: int, beta: float = 1.3, *, stretch: tuple[float, float] = (1.0, 1.0), low: float = 1.0
@@ -49,8 +57,10 @@ def shade(image: np.ndarray, gain: np.ndarray) -> np.ndarray:
 
 def blend(a: np.ndarray, b: Colour, weight: np.ndarray) -> np.ndarray:
     """a where weight = 0, b where weight = 1."""
-    w = weight[..., None].astype(np.float32)
-    return a * (1 - w) + np.asarray(b, dtype=np.float32) * w
+    out = np.asarray(b, dtype=np.float32) - a
+    out *= weight[..., None].astype(np.float32)
+    out += a
+    return out
 
 
 def smooth(edge0: float, edge1: float, t: np.ndarray) -> np.ndarray:
@@ -216,7 +226,7 @@ def _motif(rng: np.random.Generator, n: int, m: int, repeat: int, pattern: str) 
         ink = smooth(0.0, 0.12, np.sin(2.2 * field) * 0.6 + window - 0.55)
         second = smooth(0.0, 0.1, 0.35 - np.abs(field)) * smooth(0.25, 0.4, window)
     else:
-        count = 3 if pattern == "floral" else 7
+        count = 6 if pattern == "floral" else 11
         for _ in range(count):
             cx, cy, size = rng.uniform(-0.62, 0.62), rng.uniform(-0.62, 0.62), rng.uniform(0.14, 0.3)
             turn = rng.uniform(0, 2 * np.pi)
@@ -324,4 +334,4 @@ def leaf(rng: np.random.Generator, n: int, *, dark: Colour, light: Colour) -> np
 
 def earth(rng: np.random.Generator, n: int) -> np.ndarray:
     """Potting soil."""
-    return ramp(np.clip(0.5 + 0.25 * noise(rng, n, 0.6, low=6), 0, 1), (0.1, 0.06, 0.04), (0.36, 0.25, 0.17))
+    return ramp(np.clip(0.5 + 0.2 * noise(rng, n, 0.6, low=6) + 0.12 * noise(rng, n, 1.6), 0, 1), (0.1, 0.06, 0.04), (0.36, 0.25, 0.17))
