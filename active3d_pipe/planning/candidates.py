@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -10,8 +11,8 @@ from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.free_space import FreeSpace
 from active3d_pipe.structures.camera import Camera
 
-# Rays of the sphere: rows of elevation x columns of azimuth, 5 degrees apart.
-NUM_AZIMUTHS, NUM_ELEVATIONS = 72, 36
+# Rays of the sphere: rows of elevation x columns of azimuth, 6 degrees apart.
+NUM_AZIMUTHS, NUM_ELEVATIONS = 60, 30
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,6 +23,7 @@ class Directions:
         rays: (M, 3) float32 unit directions, world. solid_angles: (M,) float32, sr.
         rotations: (V, 3, 3) R_world_camera of the views. yaws, pitches: (V,) rad.
         members: (V, M) float32, 1 where a ray lies in the image of a view.
+        angles: (V, V) rad, rotation between two views.
     """
 
     rays: np.ndarray
@@ -30,28 +32,32 @@ class Directions:
     yaws: np.ndarray
     pitches: np.ndarray
     members: np.ndarray
+    angles: np.ndarray
 
 
-def view_directions(camera: Camera, settings: PlanningSettings) -> Directions:
-    """Level views: `num_yaws` times `pitches_deg`, on a sphere of rays."""
+@lru_cache(maxsize=4)
+def view_directions(camera: Camera, num_yaws: int, pitches_deg: tuple[float, ...]) -> Directions:
+    """Level views: `num_yaws` evenly spread times `pitches_deg` (up > 0), on a sphere of rays. Pure, so cached."""
     azimuth = (np.arange(NUM_AZIMUTHS) + 0.5) * (2 * math.pi / NUM_AZIMUTHS) - math.pi
     edges = np.linspace(-math.pi / 2, math.pi / 2, NUM_ELEVATIONS + 1)
     elevation = 0.5 * (edges[1:] + edges[:-1])
     band = (np.sin(edges[1:]) - np.sin(edges[:-1])) * (2 * math.pi / NUM_AZIMUTHS)
     el, az = (a.ravel() for a in np.meshgrid(elevation, azimuth, indexing="ij"))
     rays = np.stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)], axis=-1)
-    yaw_steps = np.arange(settings.num_yaws) * (2 * math.pi / settings.num_yaws) - math.pi
-    yaws, pitches = (a.ravel() for a in np.meshgrid(yaw_steps, np.radians(settings.pitches_deg), indexing="ij"))
+    yaw_steps = np.arange(num_yaws) * (2 * math.pi / num_yaws) - math.pi
+    yaws, pitches = (a.ravel() for a in np.meshgrid(yaw_steps, np.radians(pitches_deg), indexing="ij"))
     rotations = np.stack([
         se3.pose_from_yaw_pitch(np.zeros(3), y, p)[:3, :3] for y, p in zip(yaws, pitches, strict=True)
     ])
-    local = np.einsum("vji,mj->vmi", rotations, rays)
+    local = np.tensordot(rays, rotations, axes=(1, 1)).transpose(1, 0, 2)
+    flat = rotations.reshape(len(rotations), 9)
+    angles = np.arccos(np.clip((flat @ flat.T - 1) / 2, -1, 1))
     z = np.maximum(local[..., 2], 1e-9)
     u, v = camera.fx * local[..., 0] / z + camera.cx, camera.fy * local[..., 1] / z + camera.cy
     members = (local[..., 2] > 1e-6) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
     return Directions(
         rays.astype(np.float32), np.repeat(band, NUM_AZIMUTHS).astype(np.float32), rotations, yaws, pitches,
-        members.astype(np.float32),
+        members.astype(np.float32), angles,
     )
 
 

@@ -132,22 +132,20 @@ def _shortlist(
     that the list holds alternatives. Those by reward alone decide whether anything is left to see.
     """
     out: list[tuple[int, int]] = []
-    cos_near = math.cos(math.radians(40))
+    near_angle = math.radians(40)
+    near_voxels = max(1, round(0.5 * settings.coarse_spacing_m / settings.fine_spacing_m))
+    taken = np.zeros(rewards.shape, bool)
     for ranking, count in ((rewards, settings.exact_top // 4), (utility, settings.exact_top)):
-        flat = np.argpartition(-ranking, min(ranking.size - 1, 12 * settings.exact_top), axis=None)
-        flat = flat[: 12 * settings.exact_top]
-        flat = flat[np.argsort(-ranking.ravel()[flat], kind="stable")]
-        for f in flat:
-            if len(out) >= count:
+        left = np.where(taken, -1, ranking)
+        while len(out) < count:
+            p, v = divmod(int(left.argmax()), rewards.shape[1])
+            if left[p, v] <= 0:
                 break
-            p, v = divmod(int(f), rewards.shape[1])
-            near = any(
-                np.abs(voxels[p] - voxels[q]).max() <= 2
-                and directions.rotations[v][:, 2] @ directions.rotations[w][:, 2] > cos_near
-                for q, w in out
-            )
-            if not near:
-                out.append((p, v))
+            out.append((p, v))
+            close = np.abs(voxels - voxels[p]).max(axis=1) <= near_voxels
+            similar = np.ix_(close, directions.angles[v] < near_angle)
+            left[similar] = -1
+            taken[similar] = True
     return out
 
 
@@ -203,9 +201,12 @@ def looks_along(
     rewards = sphere_rewards(field, waypoints, directions).astype(np.float64)
     turn = np.radians(motion.max_turn_deg) * max(1.0, np.floor(arc[-1] / (n + 1) / motion.max_step_m))
     R = directions.rotations
-    angle = np.arccos(np.clip((np.einsum("aij,bij->ab", R, R) - 1) / 2, -1, 1))
-    from_start = np.arccos(np.clip((np.einsum("ij,bij->b", R_start, R) - 1) / 2, -1, 1))
-    to_goal = np.arccos(np.clip((np.einsum("ij,bij->b", T_goal[:3, :3], R) - 1) / 2, -1, 1))
+    angle, flat = directions.angles, R.reshape(len(R), 9)
+
+    def off(other: np.ndarray) -> np.ndarray:
+        return np.arccos(np.clip((flat @ other.ravel() - 1) / 2, -1, 1))
+
+    from_start, to_goal = off(R_start), off(T_goal[:3, :3])
     # Turning farther than the steps allow costs steps on the spot: forbidden unless nothing else is possible.
     penalty = 1e3 * (1 + rewards.max())
 

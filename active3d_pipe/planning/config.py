@@ -15,12 +15,12 @@ class PlanningSettings(Settings):
     # Candidates.
     coarse_spacing_m: float = Field(0.5, gt=0, description="spacing of candidate positions over all free space, m")
     fine_spacing_m: float = Field(0.25, gt=0, description="spacing of the positions around the best coarse ones, m")
-    max_positions: int = Field(700, ge=1, description="coarse positions at most; the spacing grows to keep to it")
-    refine_top: int = Field(8, ge=0, description="coarse positions that are refined")
+    max_positions: int = Field(500, ge=1, description="coarse positions at most; the spacing grows to keep to it")
+    refine_top: int = Field(4, ge=0, description="coarse positions that are refined")
     num_yaws: int = Field(24, ge=1, description="view directions around the vertical, evenly spread")
     pitches_deg: tuple[float, ...] = Field((-35.0, 0.0, 30.0), min_length=1, description="view pitch, degrees, up > 0")
     max_range_m: float = Field(5.0, gt=0, description="how far a view is expected to see, m")
-    exact_top: int = Field(40, ge=1, description="candidates whose visible set is computed exactly")
+    exact_top: int = Field(32, ge=1, description="candidates whose visible set is computed exactly")
     unknown_free_path_m: float = Field(
         1.0, gt=0, description="mean length of a ray through unknown space before something stops it, m"
     )
@@ -35,7 +35,7 @@ class PlanningSettings(Settings):
     commitment: float = Field(
         1.25, ge=1, description="factor on the utility of going on to the goal of the decision before"
     )
-    stop_reward: float = Field(4.0, ge=0, description="stop when no reachable view has a higher expected reward")
+    stop_reward: float = Field(8.0, ge=0, description="stop when no reachable view has a higher expected reward")
     max_steps_per_round: int = Field(20, ge=1, description="steps of one decision at most; longer paths are cut")
     min_steps_per_round: int = Field(
         10, ge=1, description="a shorter path is continued to the next view, seen from its end"

@@ -64,7 +64,7 @@ def decide(
         )
     walked = np.concatenate([np.asarray(walked_poses, dtype=np.float64).reshape(-1, 4, 4), T[None]])
     field = build_reward_field(volume, walked, camera, settings)
-    directions = view_directions(camera, settings)
+    directions = view_directions(camera, settings.num_yaws, settings.pitches_deg)
     best = 0.0
     for relaxed in (False, True):
         space = build_free_space(volume, T, walked[:, :3, 3], motion, settings, relaxed=relaxed)
@@ -167,7 +167,7 @@ def _poses(
     max_steps: int | None,
 ) -> np.ndarray:
     """Step poses along a path, looking where the reward lies on the way."""
-    directions = view_directions(camera, settings)
+    directions = view_directions(camera, settings.num_yaws, settings.pitches_deg)
     looks = looks_along(path.points, T[:3, :3], T_goal, field, directions, motion, settings.coarse_spacing_m)
     return step_path(T, path.points, looks, motion, max_steps)
 

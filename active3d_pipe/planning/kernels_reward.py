@@ -167,22 +167,49 @@ def surface_normals(kind, out):
                     out[i, j, k, 2] = np.int8(np.round(np.float32(127) * z / n))
 
 
-@njit(cache=True)
-def count_looks(opaque, through, origin, rotation, fan, shape, voxel_size, max_range, stamp, mark, looks):
-    """Add 1 to looks[v] for every voxel that a past view should have seen with certainty (no doubt in between)."""
+@njit(parallel=True, fastmath=True, cache=True)
+def count_looks(
+    origins, rotations, fan, opaque, kind, through, quality, normal, shape, voxel_size, max_range, enough,
+    quality_range,
+):
+    """How many of the past views looked at each voxel without the result that they promised, (size,) int32.
+
+    A ray promises to settle the first voxel at which its way is no longer certain, when that one is open, and to
+    bring a surface voxel that it meets up to the quality of its distance and angle. Half of that is demanded.
+    """
     nx, ny, nz = shape
-    ids = np.empty(nx + ny + nz + 3, np.int32)
-    for r in range(fan.shape[0]):
-        x, y, z = fan[r, 0], fan[r, 1], fan[r, 2]
-        dx = (rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z) / voxel_size
-        dy = (rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z) / voxel_size
-        dz = (rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z) / voxel_size
-        n = walk_ray(opaque, origin[0], origin[1], origin[2], dx, dy, dz, max_range, nx, ny, nz, ids)
-        for m in range(n):
-            v = ids[m]
-            if stamp[v] != mark:
-                stamp[v] = mark
-                if looks[v] < 255:
-                    looks[v] += 1
-            if through[v] < np.float32(1.0):
-                break
+    count, chunks = origins.shape[0], 2
+    looks = np.zeros((chunks, nx * ny * nz), np.int32)
+    for chunk in prange(chunks):
+        stamp = np.full(nx * ny * nz, -1, np.int32)
+        ids = np.empty(nx + ny + nz + 3, np.int32)
+        for c in range(chunk, count, chunks):
+            R = rotations[c]
+            ox, oy, oz = origins[c, 0], origins[c, 1], origins[c, 2]
+            for r in range(fan.shape[0]):
+                x, y, z = fan[r, 0], fan[r, 1], fan[r, 2]
+                dx = (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z) / voxel_size
+                dy = (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z) / voxel_size
+                dz = (R[2, 0] * x + R[2, 1] * y + R[2, 2] * z) / voxel_size
+                n = walk_ray(opaque, ox, oy, oz, dx, dy, dz, max_range, nx, ny, nz, ids)
+                for m in range(n):
+                    v = ids[m]
+                    if kind[v] == 0:
+                        continue
+                    if stamp[v] != c:
+                        promised = kind[v] == 1
+                        if kind[v] == 2:
+                            a = np.float32(v // (ny * nz)) + np.float32(0.5) - ox
+                            b = np.float32((v // nz) % ny) + np.float32(0.5) - oy
+                            d = np.float32(v % nz) + np.float32(0.5) - oz
+                            t = voxel_size * np.sqrt(a * a + b * b + d * d)
+                            share, _ = surface_share(
+                                normal, v, dx, dy, dz, voxel_size, t, quality, enough, quality_range
+                            )
+                            promised = share > np.float32(0.5) * (ONE - quality[v] / enough)
+                        if promised:
+                            stamp[v] = c
+                            looks[chunk, v] += 1
+                    if through[v] < ONE:
+                        break
+    return looks[0] + looks[1]

@@ -68,14 +68,13 @@ def build_reward_field(
     kernels.surface_normals(kind, normal)
     skip = kernels_distance.distance_transform((kind != FREE).view(np.uint8), LONGEST_SKIP, True).astype(np.uint8)
     opaque = (kind == SURFACE).view(np.uint8).ravel()
-    looks = _looks(grid, opaque, through, walked_poses, camera, reach, settings)
-    credit = np.where(
-        (kind == OPEN).ravel(), np.float32(settings.credit_factor) ** looks.astype(np.float32), np.float32(1)
-    )
+    quality = np.ascontiguousarray(first.quality).ravel()
+    looks = _looks(grid, opaque, kind.ravel(), through, quality, normal.reshape(-1, 3), walked_poses, camera, settings)
+    credit = np.float32(settings.credit_factor) ** looks.astype(np.float32)
     volumes: InformationVolumes = information_volumes(volume.arrays, information, credit.reshape(grid.shape))
     return RewardField(
         grid, information, reach, kind.ravel(), opaque, skip.ravel(), volumes.value.ravel(), through,
-        volumes.surface_value.ravel(), np.ascontiguousarray(volumes.quality).ravel(), normal.reshape(-1, 3),
+        volumes.surface_value.ravel(), quality, normal.reshape(-1, 3),
         volumes.gain_imp.ravel(), volumes.gain_exp.ravel(),
     )
 
@@ -106,26 +105,27 @@ def spread_poses(poses: np.ndarray, count: int) -> np.ndarray:
 def _looks(
     grid: VoxelGrid,
     opaque: np.ndarray,
+    kind: np.ndarray,
     through: np.ndarray,
+    quality: np.ndarray,
+    normal: np.ndarray,
     poses: np.ndarray,
     camera: Camera,
-    reach: float,
     settings: PlanningSettings,
 ) -> np.ndarray:
-    """How many of the past views should have settled each voxel, (size,) uint8."""
-    looks = np.zeros(grid.size, np.uint8)
+    """How many past views promised something of each voxel that did not come true, (size,)."""
     if len(poses) == 0 or settings.credit_views == 0:
-        return looks
+        return np.zeros(grid.size, np.int32)
+    reach = min(settings.max_range_m, camera.far)
     # Coarser rays than for scoring: a voxel that only a corner of the fan touches was not really looked at.
     fan = ray_fan(camera, 2 * fan_stride(camera, grid.voxel_size, reach))[2].astype(np.float32)
-    stamp = np.full(grid.size, -1, np.int32)
-    for mark, index in enumerate(spread_poses(poses, settings.credit_views)):
-        origin = ((poses[index, :3, 3] - grid.origin) / grid.voxel_size).astype(np.float32)
-        kernels.count_looks(
-            opaque, through, origin, poses[index, :3, :3].astype(np.float32), fan, grid.shape,
-            np.float32(grid.voxel_size), np.float32(reach), stamp, mark, looks,
-        )
-    return looks
+    chosen = poses[spread_poses(poses, settings.credit_views)]
+    return kernels.count_looks(
+        np.ascontiguousarray((chosen[:, :3, 3] - grid.origin) / grid.voxel_size, dtype=np.float32),
+        np.ascontiguousarray(chosen[:, :3, :3], dtype=np.float32), fan, opaque, kind, through, quality, normal,
+        grid.shape, np.float32(grid.voxel_size), np.float32(reach),
+        np.float32(settings.information.enough_quality), np.float32(settings.information.quality_range_m),
+    )
 
 
 def sphere_rewards(field: RewardField, positions_world: np.ndarray, directions: Directions) -> np.ndarray:

@@ -1,0 +1,110 @@
+import numpy as np
+import pytest
+
+from active3d_pipe.information.config import InformationSettings
+from active3d_pipe.information.gain import (
+    FREE,
+    OPEN,
+    SURFACE,
+    classify,
+    information_volumes,
+    normalised_uncertainty,
+    view_quality,
+    visible_information,
+)
+from active3d_pipe.structures import VOLUMES
+
+
+def volumes(n=4):
+    """n voxels in a row, all never observed."""
+    arrays = {name: np.zeros((n, 1, 1), np.float32) for name in VOLUMES}
+    for name in ("occupancy",):
+        arrays[name][:] = 0.5
+    for name in ("entropy", "entropy_imp", "entropy_exp", "u_final"):
+        arrays[name][:] = 1
+    return arrays
+
+
+def observe(arrays, i, *, free=0, hit=0, occupancy, quality=0.0):
+    arrays["free_evidence"][i] = free
+    arrays["hit_evidence"][i] = hit
+    arrays["occupancy"][i] = occupancy
+    arrays["view_quality"][i] = quality
+
+
+def test_kinds():
+    a = volumes(6)
+    observe(a, 1, free=50, occupancy=0.02)
+    observe(a, 2, hit=9, occupancy=0.98)
+    observe(a, 3, free=1, occupancy=0.4)
+    observe(a, 4, free=20, hit=4, occupancy=0.3)  # thin structure: a fifth of the rays ends here
+    observe(a, 5, free=50, occupancy=0.9)  # the field believes in something that rays passed through
+    kinds = classify(a, InformationSettings()).ravel().tolist()
+    assert kinds == [OPEN, FREE, SURFACE, OPEN, SURFACE, FREE]
+
+
+def test_an_unseen_voxel_is_worth_its_weight_times_one_minus_occupancy():
+    s = InformationSettings(alpha=0.7, beta=0.2)
+    v = information_volumes(volumes(), s)
+    np.testing.assert_allclose(v.value, (0.7 * 1 + 0.2 * 1) * 0.5, rtol=1e-6)
+
+
+def test_seen_free_space_is_worth_nothing_even_when_uncertain():
+    a = volumes()
+    observe(a, 0, free=30, occupancy=0.5)
+    a["u_final"][0] = 5
+    v = information_volumes(a, InformationSettings())
+    assert v.value[0, 0, 0] == 0
+    assert v.surface_value[0, 0, 0] == 0
+    assert v.gain_imp[0, 0, 0] == 0
+
+
+def test_surface_is_worth_a_look_until_it_was_seen_well():
+    s = InformationSettings()
+    rewards = []
+    for quality in (0.0, 0.5 * s.enough_quality, s.enough_quality, 1.0):
+        a = volumes()
+        observe(a, 0, hit=9, occupancy=0.99, quality=quality)
+        rewards.append(visible_information(a, np.array([0]), s).reward)
+    assert rewards[0] > 0
+    assert rewards[1] == pytest.approx(0.5 * rewards[0])
+    assert rewards[2] == rewards[3] == 0
+
+
+def test_expected_entropy_reduction_leaves_the_residual():
+    s = InformationSettings(residual_bits=0.25)
+    a = volumes()
+    a["entropy_exp"][:] = 0.1
+    terms = visible_information(a, np.array([0, 1, 2]), s)
+    assert terms.gain_imp == pytest.approx(3 * 0.75)
+    assert terms.gain_exp == 0
+    assert terms.gain == terms.gain_imp
+    assert (terms.num_visible, terms.num_open) == (3, 3)
+
+
+def test_no_visible_voxels_no_gain():
+    terms = visible_information(volumes(), np.array([], dtype=np.int64))
+    assert (terms.reward, terms.gain, terms.num_visible) == (0, 0, 0)
+
+
+def test_credit_scales_everything_expected():
+    a = volumes()
+    observe(a, 1, hit=9, occupancy=0.99)
+    s = InformationSettings()
+    full, half = information_volumes(a, s), information_volumes(a, s, np.full((4, 1, 1), 0.5))
+    for name in ("value", "surface_value", "gain_imp", "gain_exp"):
+        np.testing.assert_allclose(getattr(half, name), 0.5 * getattr(full, name), rtol=1e-6)
+
+
+def test_uncertainty_is_measured_by_its_level_in_unseen_space():
+    u = np.array([2.0, 2.0, 2.0, 1.0, 9.0, -1.0], np.float32)
+    observed = np.array([False, False, False, True, True, True])
+    np.testing.assert_allclose(normalised_uncertainty(u, observed), [1, 1, 1, 0.5, 2, 0])
+    np.testing.assert_array_equal(normalised_uncertainty(np.zeros(6, np.float32), observed), 0)
+
+
+def test_view_quality_prefers_close_and_frontal():
+    s = InformationSettings(quality_range_m=1.0)
+    assert view_quality(1.0, 0.5, s) == 1
+    assert view_quality(-1.0, 2.0, s) == pytest.approx(0.5)
+    assert view_quality(0.5, 1.0, s) == pytest.approx(0.5)
