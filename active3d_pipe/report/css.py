@@ -38,6 +38,7 @@ tr.stage th { padding-left: 8px; }
 .note, p.missing { color: var(--muted); font-size: 13px; }
 p.missing { background: var(--soft); border-left: 3px solid var(--rule); padding: 10px 14px; margin: 8px 0 0; }
 .wide { overflow-x: auto; }
+.tall table { width: 100%; }
 .tall { max-height: 520px; overflow-y: auto; border: 1px solid var(--rule); border-radius: 8px; padding: 0 14px; }
 .tall thead th { position: sticky; top: 0; padding-top: 8px; }
 .tag { background: var(--soft); border: 1px solid var(--rule); border-radius: 10px; padding: 0 8px; font-size: 12.5px;

@@ -13,7 +13,7 @@ from active3d_pipe.report.data import Curve, DecisionRow, FloorPlan, FusionHisto
 from active3d_pipe.report.style import FREE, GREEN, INK, MARKERS, MUTED, SERIES, SKY, UNKNOWN, VERMILION, draw
 
 PLAN_COLORS = ListedColormap([FREE, UNKNOWN, "#52606d"])
-MAX_MARKS = 60  # goals that are numbered, headings that are drawn
+MAX_MARKS = 40  # goals that are numbered, headings that are drawn
 
 
 def floor_plan(data: ReportData, scale: float) -> str:
@@ -38,7 +38,7 @@ def floor_plan(data: ReportData, scale: float) -> str:
         if data.goals is not None and len(data.goals):
             _paint_goals(axes, np.asarray(data.goals))
         if len(positions):
-            ends = ((0, "^", 110, GREEN, "start"), (-1, "s", 80, VERMILION, "end"))
+            ends = ((-1, "s", 150, VERMILION, "end"), (0, "^", 70, GREEN, "start"))
             for i, marker, size, color, label in ends:
                 x, y = positions[i, :2]
                 axes.scatter(x, y, marker=marker, s=size, color=color, edgecolor="white", zorder=6, label=label)
@@ -81,7 +81,7 @@ def _paint_track(figure: Figure, axes: Axes, poses: np.ndarray, positions: np.nd
     heading = poses[::every, :2, 2]
     axes.quiver(
         positions[::every, 0], positions[::every, 1], heading[:, 0], heading[:, 1], color=MUTED, width=0.0022,
-        scale=42, headwidth=4, zorder=3.5, alpha=0.8,
+        scale=45, headwidth=4, zorder=3.5, alpha=0.7,
     )
     if len(segments):
         figure.colorbar(track, ax=axes, shrink=0.75, pad=0.02, label="exploration step")
@@ -90,9 +90,10 @@ def _paint_track(figure: Figure, axes: Axes, poses: np.ndarray, positions: np.nd
 def _paint_goals(axes: Axes, goals: np.ndarray) -> None:
     axes.scatter(goals[:, 0], goals[:, 1], marker="x", s=42, color=VERMILION, linewidth=1.6, zorder=5,
                  label=f"chosen views ({len(goals)})")
-    every = max(1, len(goals) // (MAX_MARKS // 2))
+    every = max(1, len(goals) // MAX_MARKS)
     for i in range(0, len(goals), every):
-        axes.annotate(str(i), (goals[i, 0], goals[i, 1]), xytext=(4, 4), textcoords="offset points", fontsize=7, color=INK, zorder=7)
+        place = (goals[i, 0], goals[i, 1])
+        axes.annotate(str(i), place, xytext=(4, 4), textcoords="offset points", fontsize=7, color=INK, zorder=7)
 
 
 def curves(series: Sequence[Curve], scale: float) -> str:
@@ -128,7 +129,7 @@ def _paint_curves(axes: Axes, panel: str, series: Sequence[Curve]) -> None:
     if percent:
         axes.set_ylim(0, 104)
     else:
-        axes.yaxis.set_major_formatter(lambda v, _: f"{v:,.0f}".replace(",", " ") if abs(v) >= 1000 else f"{v:g}")
+        axes.yaxis.set_major_formatter(lambda v, _: f"{v:,.0f}".replace(",", "\u202f") if abs(v) >= 1000 else f"{v:g}")
     if len(series) > 1:
         axes.legend(fontsize=8)
 
@@ -186,6 +187,7 @@ def timings(rows: Sequence[Timing], scale: float) -> str:
     """One bar for every stage, stacked by module."""
     stages = list(dict.fromkeys(r.stage for r in rows))
     total = sum(r.seconds for r in rows) or 1.0
+    longest = max(sum(r.seconds for r in rows if r.stage == stage) for stage in stages)
 
     def paint(figure: Figure) -> None:
         axes = figure.add_subplot()
@@ -194,7 +196,7 @@ def timings(rows: Sequence[Timing], scale: float) -> str:
             mine = [r for r in rows if r.stage == stage]
             for i, r in enumerate(mine):
                 axes.barh(y, r.seconds, left=left, height=0.62, color=SERIES[i % len(SERIES)], edgecolor="white")
-                if r.seconds > 0.11 * max(total, 1e-9) * 0.6 + 0.012 * total * len(r.module) / 2:
+                if r.seconds > 0.009 * longest * (len(r.module) + 2):  # the name fits into its bar
                     axes.text(left + r.seconds / 2, y, r.module, ha="center", va="center", color="white", fontsize=8)
                 left += r.seconds
             axes.text(left, y, f"  {left:.1f} s, {100 * left / total:.0f} %", va="center", fontsize=8.5)

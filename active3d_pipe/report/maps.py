@@ -5,6 +5,7 @@ from html import escape
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
@@ -88,47 +89,58 @@ def _colour_scales(settings: ReportSettings, deepest: float) -> str:
 
 
 def slices_figure(series: Sequence[SliceSeries], plan: FloorPlan | None, settings: ReportSettings) -> str:
-    """One row for every volume, rounds as columns, one colour scale a row."""
+    """One row for every volume, rounds as columns, one colour scale a row, x to the right and y up."""
     shown = [(s, spread(list(s.rounds), settings.max_rounds)) for s in series if len(s.rounds)]
     columns = max(len(rounds) for _, rounds in shown)
-    rows, cols = _known_window([a for _, rounds in shown for _, a in rounds])
-    first = shown[0][1][0][1]
-    extent = (0.0, float(first.shape[0]), 0.0, float(first.shape[1]))
-    if plan is not None and plan.occupancy.shape == first.shape:
-        extent = plan.extent
-    unit = "m" if plan is not None and plan.occupancy.shape == first.shape else "voxel"
-    step = (extent[1] - extent[0]) / first.shape[0]
-    limits = (extent[0] + rows.start * step, extent[0] + rows.stop * step,
-              extent[2] + cols.start * step, extent[2] + cols.stop * step)
-    cell_w = 10.2 / columns
-    cell_h = float(np.clip(cell_w * (limits[3] - limits[2]) / (limits[1] - limits[0]), 0.6, 2.6))
+    window = _known_window([a for _, rounds in shown for _, a in rounds])
+    width, height = (w.stop - w.start for w in window)
+    gap = max(1, round(0.05 * width))
+    total = columns * width + (columns - 1) * gap
+    left, right, top, bottom = 0.95, 0.85, 0.3, 0.42  # margins, inches
+    cell_h = float(np.clip((11.4 - left - right) * height / total, 0.5, 2.6))
+    row_w = cell_h * total / height
+    figure_w, figure_h = left + row_w + right, top + bottom + len(shown) * (cell_h + 0.14)
 
     def paint(figure: Figure) -> None:
-        grid = figure.subplots(len(shown), columns, squeeze=False, sharex=True, sharey=True)
-        for line, (s, rounds) in zip(grid, shown):
-            low, high = _range([a[rows, cols] for _, a in rounds])
+        figure.set_layout_engine("none")
+        for n, (s, rounds) in enumerate(shown):
+            low, high = _range([a[window] for _, a in rounds])
+            y = figure_h - top - (n + 1) * cell_h - n * 0.14
+            axes = figure.add_axes((left / figure_w, y / figure_h, row_w / figure_w, cell_h / figure_h))
+            mosaic = np.full((total, height, 4), 1.0)
             colours = matplotlib.colormaps["gray_r" if s.name == "occupancy" else "viridis"].with_extremes(bad=UNKNOWN)
-            picture = None
-            for axes, (number, array) in zip(line, rounds):
-                picture = axes.imshow(array.T, origin="lower", extent=extent, cmap=colours, vmin=low, vmax=high,
-                                      interpolation="nearest")
-                axes.set(xlim=limits[:2], ylim=limits[2:])
-                axes.grid(False)
-                axes.tick_params(labelsize=6.5)
-                if line is grid[0]:
-                    axes.set_title(f"round {number}", fontsize=8.5)
-            for axes in line[len(rounds):]:
-                axes.set_axis_off()
-            line[0].set_ylabel(f"{s.name}\ny [{unit}]", color="#1f2933", fontsize=8.5)
-            if picture is not None:
-                bar = figure.colorbar(picture, ax=list(line), fraction=0.03, pad=0.01, aspect=14)
-                bar.set_label(f"[{s.unit}]" if s.unit not in ("", "1") else "", fontsize=7.5)
-                bar.ax.tick_params(labelsize=6.5)
-        for axes in grid[-1]:
-            axes.set_xlabel(f"x [{unit}]", fontsize=7.5)
+            scale = ScalarMappable(Normalize(low, high), colours)
+            for k, (number, array) in enumerate(rounds):
+                start = k * (width + gap)
+                mosaic[start : start + width] = scale.to_rgba(np.ma.masked_invalid(array[window]))
+                if n == 0:
+                    place = start + width / 2, height * (1 + 0.12 / cell_h)
+                    axes.text(*place, f"round {number}", ha="center", fontsize=8.5)
+            axes.imshow(mosaic.swapaxes(0, 1), origin="lower", extent=(0, total, 0, height), interpolation="nearest")
+            axes.set_axis_off()
+            place = (left - 0.1) / figure_w, (y + cell_h / 2) / figure_h
+            figure.text(*place, s.name, ha="right", va="center", fontsize=9)
+            bar = figure.add_axes(((left + row_w + 0.12) / figure_w, y / figure_h, 0.1 / figure_w, cell_h / figure_h))
+            figure.colorbar(scale, cax=bar)
+            bar.tick_params(labelsize=7)
+            if s.unit not in ("", "1"):
+                bar.set_ylabel(f"[{s.unit}]", fontsize=7.5)
+            if n == len(shown) - 1:
+                _scale_bar(figure, axes, width, plan)
 
-    height = (cell_h + 0.16) * len(shown) + 0.55
-    return draw(11.4, height, paint, settings.figure_scale, "Slices of the volumes over rounds")
+    return draw(figure_w, figure_h, paint, settings.figure_scale, "Slices of the volumes over rounds")
+
+
+def _scale_bar(figure: Figure, axes: Axes, width: int, plan: FloorPlan | None) -> None:
+    """A bar of a round number of metres (voxels where the grid is not known) under the first slice."""
+    size = plan.voxel_size if plan is not None else 1.0
+    length = max((v for v in (0.5, 1, 2, 5, 10, 20, 50, 100) if v <= 0.5 * width * size), default=0.5 * width * size)
+    unit = "m" if plan is not None else "voxels"
+    inch = axes.get_position().height * figure.get_figheight()
+    y = -0.1 * axes.get_ylim()[1] / inch
+    axes.plot([0, length / size], [y, y], color="#1f2933", linewidth=2, clip_on=False, solid_capstyle="butt")
+    axes.text(length / size, y, f"  {length:g} {unit}", va="center", fontsize=8, clip_on=False)
+    axes.set_ylim(0, axes.get_ylim()[1])
 
 
 def _known_window(arrays: Sequence[np.ndarray]) -> tuple[slice, slice]:

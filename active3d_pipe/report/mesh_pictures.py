@@ -10,9 +10,9 @@ from active3d_pipe.geometry.raycasting import NO_HIT, SurfaceIndex
 from active3d_pipe.report.data import Picture
 from active3d_pipe.structures import Camera, TriangleMesh
 
-BACKGROUND = np.float32([1.0, 1.0, 1.0])
-BARE = np.float32([0.78, 0.80, 0.83])  # of a mesh without colours
-LIGHT = np.float32([0.35, 0.25, 0.90]) / np.linalg.norm([0.35, 0.25, 0.90])
+BACKGROUND = np.ones(3, np.float32)
+BARE = np.array([0.78, 0.80, 0.83], np.float32)  # of a mesh without colours
+LIGHT = np.array([0.35, 0.25, 0.90], np.float32) / np.linalg.norm([0.35, 0.25, 0.90])
 SAMPLES = 2  # rays per pixel along each axis
 MAX_LAYERS = 6  # back faces that a ray may pass
 
@@ -145,20 +145,30 @@ def default_views(mesh: TriangleMesh, poses: np.ndarray | None, width_px: int = 
         return []
     low, high = _bounds(mesh)
     cut = float(low[2] + 0.75 * (high[2] - low[2]))
-    centre = np.array([*(0.5 * (low + high))[:2], low[2] + 0.3 * (high[2] - low[2])])
-    size = float(np.linalg.norm((high - low)[:2]))
     camera = Camera.from_fov(width_px, round(width_px * 0.72), 50)
     see_through = poses is None or _normals_face_the_room(mesh, poses)
     views = [MeshView("from above, ceiling cut", top_rays(low, high, width_px), see_through, cut)]
     for azimuth, name in ((-125.0, "from outside, south-west"), (55.0, "from outside, north-east")):
         a = np.radians(azimuth)
-        eye = centre + size * np.array([0.85 * np.cos(a), 0.85 * np.sin(a), 0.72])
-        views.append(MeshView(name, perspective_rays(camera, se3.look_at(eye, centre)), see_through, cut))
+        towards = np.array([np.cos(a), np.sin(a), 0.85])
+        pose = _fit(camera, low, np.array([*high[:2], cut]), towards / np.linalg.norm(towards))
+        views.append(MeshView(name, perspective_rays(camera, pose), see_through, cut))
     if poses is not None and len(poses):
         inside = Camera.from_fov(width_px, round(width_px * 0.72), 90)
         pose = poses[_most_open(mesh, poses)]
         views.append(MeshView("from a pose of the run", perspective_rays(inside, pose), False, None))
     return views
+
+
+def _fit(camera: Camera, low: np.ndarray, high: np.ndarray, towards: np.ndarray) -> np.ndarray:
+    """T_world_camera that looks from direction `towards` at a box and just holds all of it."""
+    centre = 0.5 * (low + high)
+    corners = np.array(np.meshgrid(*zip(low, high))).reshape(3, -1).T
+    pose = se3.look_at(centre + towards, centre)
+    p = (corners - centre) @ pose[:3, :3]  # camera axes, origin at the box's centre
+    across = np.maximum(np.abs(p[:, 0]) * camera.fx / camera.cx, np.abs(p[:, 1]) * camera.fy / camera.cy)
+    distance = float((across - p[:, 2]).max()) * 1.03
+    return se3.look_at(centre + distance * towards, centre)
 
 
 def _bounds(mesh: TriangleMesh) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,8 @@ LEADS = {
     "metrics": "Accuracy goes from the reconstruction to the truth, completion from the truth to the reconstruction. "
     "“Surface” measures to the other mesh's surface and is the figure to quote; point-to-point figures have a floor "
     "from sampling alone and do not compare between scenes.",
-    "floor_plan": "A horizontal slice of what the map holds for free, occupied and unknown, and the path over it.",
+    "floor_plan": "A horizontal slice of what the map holds for free, occupied and unknown, and the path over it; "
+    "arrows show where the camera looked, numbers the order of the chosen views.",
     "curves": "What the run knew after so many exploration steps.",
     "views": "Poses that the run never visited, from the worst render shown to the best. Grey: nothing is known there "
     "in the truth (errors) or nothing was rendered (depth).",

@@ -94,13 +94,15 @@ def colorize(values: np.ndarray, cmap: str, low: float, high: float, invalid: np
 
 
 def nice_number(value: float | None, digits: int = 3) -> str:
-    """A short number for people: 3 significant digits, thousands grouped, an en dash for None."""
+    """A short number for people: 3 significant digits, integers in full, thousands grouped, an en dash for None."""
     if value is None or not np.isfinite(value):
         return "–"
+    if isinstance(value, int | np.integer):
+        return f"{value:,}".replace(",", "\u202f")
     if value == 0:
         return "0"
     if abs(value) >= 1000:
-        return f"{value:,.0f}".replace(",", " ")  # narrow no-break space
+        return f"{value:,.0f}".replace(",", "\u202f")  # narrow no-break space
     if abs(value) < 1e-3:
         return f"{value:.1e}"
     decimals = max(0, digits - 1 - int(np.floor(np.log10(abs(value)))))

@@ -37,6 +37,7 @@ LAYOUTS: tuple[Layout, ...] = (
     ),
 )
 STATISTICS = ("_median", "_p10")  # of the psnr rows: their suffix comes after the view set's
+DECIMALS = {"cm": 2, "dB": 2, "m": 1, "m²": 1, "s": 2, "MB": 0}
 COUNTS = ("num_views", "steps", "rounds", "collisions", "keyframes", "gaussians")
 
 
@@ -48,7 +49,8 @@ def value_text(metric: Metric, name: str = "") -> str:
         return f"{100 * metric.value:.1f} %"
     if any(name.startswith(c) for c in COUNTS):
         return nice_number(round(metric.value))
-    text = nice_number(metric.value)
+    decimals = DECIMALS.get(metric.unit)
+    text = nice_number(metric.value) if decimals is None else f"{metric.value:.{decimals}f}"
     return f"{text} {metric.unit}".strip()
 
 
@@ -67,8 +69,11 @@ def metrics_tables(metrics: Mapping[str, Metric]) -> str:
             "<h3>Run</h3><table><thead><tr><th>metric<th class=num>value<th>meaning</tr></thead>"
             f"<tbody>{''.join(rows)}</tbody></table>"
         )
-    notes = {f"{name}: {m.note}" for name, m in metrics.items() if m.value is None and m.note and name in used}
-    parts += [f"<p class=note>{escape(text)}</p>" for text in sorted(notes)]
+    reasons: dict[str, list[str]] = {}
+    for name, m in metrics.items():
+        if m.value is None and m.note and name in used:
+            reasons.setdefault(m.note, []).append(name)
+    parts += [f"<p class=note>–  {escape(', '.join(n))}: {escape(why)}</p>" for why, n in reasons.items()]
     return "\n".join(p for p in parts if p)
 
 
@@ -135,7 +140,7 @@ def _readable(name: str) -> str:
             for suffix, heading in suffixes.items():
                 if name == _full(base, suffix):
                     return f"{bases[base].split(',')[0].split(':')[0].split(' within')[0]} · {heading.strip()}"
-    words = name.replace("_", " ")
+    words = name.removesuffix("_m").removesuffix("_mb").removesuffix("_cm").replace("_", " ")
     return words[:1].upper() + words[1:]
 
 
