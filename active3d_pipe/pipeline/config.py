@@ -19,18 +19,11 @@ from active3d_pipe.pipeline.config_text import resolved_toml
 from active3d_pipe.pipeline.layers import Layers, merge_overrides, read_layers, read_toml
 from active3d_pipe.pipeline.settings import RunSettings
 from active3d_pipe.planning.config import PlanningSettings
+from active3d_pipe.report.config import ReportSettings
 from active3d_pipe.sim.config import CameraSettings, SceneSettings, SensorSettings
 from active3d_pipe.structures.motion import MotionSettings
 from active3d_pipe.structures.settings import Settings
 from active3d_pipe.uncertainty.config import UncertaintySettings
-
-try:
-    from active3d_pipe.report.config import ReportSettings
-except ModuleNotFoundError:  # until the room is there
-
-    class ReportSettings(Settings):  # type: ignore[no-redef]
-        """Stand-in."""
-
 
 AnySettings = TypeVar("AnySettings", bound=Settings)
 

@@ -16,7 +16,7 @@ from active3d_pipe.pipeline.interrupt import Interrupted, StopRequest
 from active3d_pipe.pipeline.journal import spent
 from active3d_pipe.pipeline.lock import RunLock
 from active3d_pipe.pipeline.record import Record
-from active3d_pipe.pipeline.run_dir import RunDir
+from active3d_pipe.pipeline.run_dir import Manifest, RunDir
 from active3d_pipe.pipeline.stage import NodeId
 from active3d_pipe.pipeline.survey import NodeState, State, Surveyor
 
@@ -44,12 +44,15 @@ class Runner:
     `config` needs a `run` section (`seed`, `steps`, `max_rounds`, `threads`, `keep`); the rest is the stages' own.
     """
 
-    def __init__(self, run_dir: RunDir, registry: Registry, config: Any, watcher: Watcher | None = None) -> None:
+    def __init__(
+        self, run_dir: RunDir, registry: Registry, config: Any, watcher: Watcher | None = None,
+        manifest: Manifest | None = None,
+    ) -> None:
         self.run_dir = run_dir
         self.registry = registry
         self.config = config
         self.watcher = watcher or Silent()
-        lineage = run_dir.manifest().lineage
+        lineage = (manifest or run_dir.manifest()).lineage
         past = [(old.until_round, type(config).model_validate(old.config)) for old in lineage]
         self.surveyor = Surveyor(run_dir.store, registry, config, past)
         self.executor = Executor(self.surveyor, run_dir.journal, self.watcher)
