@@ -35,7 +35,7 @@ def room_frame() -> tuple[np.ndarray, np.ndarray]:
     points = projection.unproject(depth, POSE, CAMERA)
     rgb = np.full((*depth.shape, 3), 0.6, np.float32)
     striped = depth == side
-    rgb[striped] = (0.5 + 0.4 * np.sign(np.sin(40 * points[striped][:, 2:3]))).astype(np.float32)
+    rgb[striped] = (0.5 + 0.4 * np.sign(np.sin(12 * points[striped][:, 2:3]))).astype(np.float32)
     return rgb, depth.astype(np.float32)
 
 
