@@ -27,7 +27,7 @@ F = np.float32
 ZERO, HALF, ONE = F(0), F(0.5), F(1)
 ALPHA_MAX = 0.99
 STOP_EVERY = 16
-AHEAD = 2
+AHEAD = 4
 # Planes of a group, forward: transmittance, r, g, b, z; backward: transmittance, S, the five gradients.
 FORWARD_PLANES, BACKWARD_PLANES = 5, 7
 FORWARD_GROUP, BACKWARD_GROUP = FORWARD_PLANES * LANES, BACKWARD_PLANES * LANES

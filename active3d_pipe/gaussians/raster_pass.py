@@ -1,5 +1,6 @@
 """One forward and backward pass of the rasteriser over plain arrays, with buffers that are reused."""
 
+import math
 from dataclasses import dataclass, field
 
 import numba
@@ -28,13 +29,15 @@ class Workspace:
 
     def get(self, name: str, shape: tuple[int, ...], dtype: type) -> np.ndarray:
         """An uninitialised C-contiguous array, 64-byte aligned; valid until the same name is asked for again."""
-        need = int(np.prod(shape)) * np.dtype(dtype).itemsize
+        need = math.prod(shape) * np.dtype(dtype).itemsize
         raw = self._buffers.get(name)
-        if raw is None or raw.nbytes < need + 64:
-            raw = np.empty(int(need * 1.2) + 128, np.uint8)
+        if raw is None or raw.nbytes < need:
+            size = need + need // 5
+            whole = np.empty(size + 64, np.uint8)
+            offset = -whole.ctypes.data % 64
+            raw = whole[offset : offset + size]
             self._buffers[name] = raw
-        offset = -raw.ctypes.data % 64
-        return raw[offset : offset + need].view(dtype).reshape(shape)
+        return raw[:need].view(dtype).reshape(shape)
 
 
 @dataclass(slots=True)
