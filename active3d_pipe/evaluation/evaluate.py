@@ -36,7 +36,8 @@ def evaluate_geometry(
     if truth.observable is not None:
         out["observable_share"] = float(truth.observable.mean())
     if seen_by:
-        whole = surface_metrics(reconstruction, truth, settings, forms=("surface", "p2p"))
+        forms = ("surface", *(form for form in truth.samples if form == "p2p"))
+        whole = surface_metrics(reconstruction, truth, settings, forms=forms)
         out |= {f"{k}_unculled": v for k, v in whole.items() if not k.endswith("_floor")}
     if query_sdf:
         out["mad_cm"] = mad_cm(query_sdf, truth.points)

@@ -15,7 +15,7 @@ class ReportSettings(Settings):
         None, description="height of the horizontal slices, m; null = the height of the start pose"
     )
     image_width_px: int = Field(480, ge=64, description="width of embedded photographs and maps, px")
-    mesh_width_px: int = Field(720, ge=64, description="width of the mesh pictures, px")
+    mesh_width_px: int = Field(640, ge=64, description="width of the mesh pictures, px")
     jpeg_quality: int = Field(86, ge=30, le=100, description="quality of embedded photographs")
     figure_scale: float = Field(2.0, ge=0.5, le=4, description="pixels per CSS pixel of the charts")
     color_error_scale: float = Field(0.25, gt=0, le=1, description="colour error at the top of the error maps' scale")
