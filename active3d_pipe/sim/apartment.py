@@ -19,9 +19,9 @@ from active3d_pipe.sim.apartment_furnishing import Furnisher
 from active3d_pipe.sim.apartment_layout import Room, make_layout
 from active3d_pipe.sim.apartment_look import make_look, make_shared
 from active3d_pipe.sim.apartment_mesh import Material, MeshBuilder
+from active3d_pipe.sim.apartment_noise import HUES
 from active3d_pipe.sim.apartment_placement import Floor
 from active3d_pipe.sim.apartment_shell import build_outer_shell, build_room_shell
-from active3d_pipe.sim.apartment_textures import HUES
 
 START_HEIGHT = 1.3  # m
 MAX_ROOMS = 8
@@ -81,22 +81,34 @@ class Apartment:
         return Image.fromarray(np.rint(values * 255).astype(np.uint8), "RGB")
 
     def to_glb(self) -> bytes:
-        """The scene as binary glTF: Z-up coordinates, one mesh per material, JPEG textures; the same bytes every time."""
+        """The scene as binary glTF: Z-up coordinates, one mesh per material, JPEG textures; always the same bytes."""
         scene = trimesh.Scene()
         for surface in self.surfaces:
             image = self.texture(surface.material)
             image.format = "JPEG"  # what the writer encodes
             material = PBRMaterial(
-                name=surface.material.name, baseColorTexture=image, baseColorFactor=[255, 255, 255, 255],
-                metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True)
+                name=surface.material.name,
+                baseColorTexture=image,
+                baseColorFactor=[255, 255, 255, 255],
+                metallicFactor=0.0,
+                roughnessFactor=1.0,
+                doubleSided=True,
+            )
             mesh = trimesh.Trimesh(
-                surface.vertices, surface.faces, process=False, validate=False,
-                visual=trimesh.visual.TextureVisuals(uv=surface.uv, material=material))
+                surface.vertices,
+                surface.faces,
+                process=False,
+                validate=False,
+                visual=trimesh.visual.TextureVisuals(uv=surface.uv, material=material),
+            )
             scene.add_geometry(mesh, node_name=surface.material.name, geom_name=surface.material.name)
 
         def describe(tree: dict[str, Any]) -> None:
-            tree["asset"] = {"version": "2.0", "generator": "active3d", "extras": {
-                "up": "Z", "units": "m", "name": self.name, "licence": "CC0-1.0"}}
+            tree["asset"] = {
+                "version": "2.0",
+                "generator": "active3d",
+                "extras": {"up": "Z", "units": "m", "name": self.name, "licence": "CC0-1.0"},
+            }
 
         data = trimesh.exchange.gltf.export_glb(scene, include_normals=False, tree_postprocessor=describe)
         return data if isinstance(data, bytes) else bytes(data)
@@ -165,20 +177,29 @@ def make_apartment(rooms: int, seed: int, *, detail: float = 1.0) -> Apartment:
         furnisher.furnish()
         floors.append(furnisher.floor)
     build_outer_shell(builder, layout, shared.shell)
-    surfaces = tuple(
-        Surface(part.material, np.concatenate(part.vertices).astype(np.float32),
-                np.concatenate(part.faces).astype(np.int32), np.concatenate(part.uv).astype(np.float32))
-        for _, part in sorted(builder.parts.items())
-    )
+    surfaces = _surfaces(builder)
     living = next(f for f in floors if f.room.kind == "living")
     return Apartment(rooms, seed, detail, tuple(layout), surfaces, _start(living, surfaces))
+
+
+def _surfaces(builder: MeshBuilder) -> tuple[Surface, ...]:
+    """The builder's triangles by material; those without area (poles of surfaces of revolution) are left out."""
+    surfaces = []
+    for _, part in sorted(builder.parts.items()):
+        vertices = np.concatenate(part.vertices).astype(np.float32)
+        faces = np.concatenate(part.faces).astype(np.int32)
+        a, b, c = (vertices[faces[:, k]] for k in range(3))
+        solid = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-10
+        surfaces.append(Surface(part.material, vertices, faces[solid], np.concatenate(part.uv).astype(np.float32)))
+    return tuple(surfaces)
 
 
 def _start(floor: Floor, surfaces: tuple[Surface, ...]) -> tuple[np.ndarray, np.ndarray]:
     """A first view: from a roomy place as far to the side as possible, across the room."""
     index = SurfaceIndex(
         np.concatenate([s.vertices[s.faces].reshape(-1, 3) for s in surfaces]),
-        np.arange(3 * sum(len(s.faces) for s in surfaces)).reshape(-1, 3))
+        np.arange(3 * sum(len(s.faces) for s in surfaces)).reshape(-1, 3),
+    )
     region = floor.region(floor.blocked)
     reach = np.ones_like(floor.blocked) if region is None else region
     cells = np.stack([*np.meshgrid(floor.xs, floor.ys, indexing="ij"), np.full(reach.shape, START_HEIGHT)], -1)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from active3d_pipe.sim.apartment_textures import Colour, blend, coordinates, noise, pick_hue, ramp, shade, smooth
+from active3d_pipe.sim.apartment_noise import Colour, blend, coordinates, noise, pick_hue, ramp, shade, smooth
 
 SPINES = (4, 24)  # rows and columns of the atlas of book spines
 PAINTINGS = (3, 3)
@@ -29,8 +29,10 @@ def _hsv(h: float, s: float, v: float) -> np.ndarray:
     return (v - v * s * np.clip(np.minimum(k, 4 - k), 0, 1)).astype(np.float32)
 
 
-def _text(rng: np.random.Generator, image: np.ndarray, box: tuple[int, int, int, int], colour: Colour, *, height: int) -> None:
-    """Marks like lines of text, in place, inside box (row0, row1, col0, col1); glyphs of strokes, words, ragged right."""
+def _text(
+    rng: np.random.Generator, image: np.ndarray, box: tuple[int, int, int, int], colour: Colour, *, height: int
+) -> None:
+    """Marks like lines of text, in place, inside box (row0, row1, col0, col1); words, ragged right."""
     r0, r1, c0, c1 = box
     step = max(2, height)
     for row in range(r0, r1 - step + 1, step + max(1, step // 2)):
@@ -71,7 +73,7 @@ def spines(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 def _landscape(rng: np.random.Generator, n: int, *, town: bool = False) -> np.ndarray:
-    u, v = coordinates(n)
+    _, v = coordinates(n)
     sky = ramp(v[:, :1] * 1.7, (0.25, 0.45, 0.78), (0.62, 0.78, 0.93), (0.95, 0.9, 0.8))
     image = np.broadcast_to(sky, (n, n, 3)).copy()
     cloud = smooth(0.2, 1.4, noise(rng, n, 1.5, stretch=(1, 2), low=2)) * smooth(0.65, 0.2, v)
@@ -104,7 +106,9 @@ def _houses(rng: np.random.Generator, image: np.ndarray, ridge: np.ndarray) -> N
         cell = max(4, n // 64)
         for r in range(top + cell // 2, bottom - cell, cell * 2):
             for c in range(col + cell // 2, min(col + w, n) - cell, cell * 2):
-                image[r : r + cell + cell // 3, c : c + cell] = (0.95, 0.85, 0.5) if rng.random() < 0.3 else (0.2, 0.25, 0.32)
+                image[r : r + cell + cell // 3, c : c + cell] = (
+                    (0.95, 0.85, 0.5) if rng.random() < 0.3 else (0.2, 0.25, 0.32)
+                )
         image[max(0, top - cell) : top, col : col + w] = (0.45, 0.22, 0.17)
         col += w + int(rng.uniform(0, 0.05) * n)
 
@@ -138,7 +142,9 @@ def _geometric(rng: np.random.Generator, n: int) -> np.ndarray:
     image = np.broadcast_to(np.asarray((0.93, 0.89, 0.8), np.float32), (n, n, 3)).copy()
     hue = pick_hue(rng)
     for _ in range(9):
-        colour = _hsv((hue + float(rng.choice([0, 0.06, 0.5, 0.55]))) % 1, rng.uniform(0.3, 0.9), rng.uniform(0.25, 0.95))
+        colour = _hsv(
+            (hue + float(rng.choice([0, 0.06, 0.5, 0.55]))) % 1, rng.uniform(0.3, 0.9), rng.uniform(0.25, 0.95)
+        )
         cx, cy, r = rng.random(), rng.random(), rng.uniform(0.08, 0.3)
         kind = rng.integers(3)
         if kind == 0:
@@ -153,17 +159,30 @@ def _geometric(rng: np.random.Generator, n: int) -> np.ndarray:
 
 def _bouquet(rng: np.random.Generator, n: int) -> np.ndarray:
     u, v = coordinates(n)
-    image = ramp(np.clip(0.5 + 0.2 * noise(rng, n, 1.7) + 0.4 * (v - 0.5), 0, 1), _hsv(pick_hue(rng), 0.35, 0.22), _hsv(pick_hue(rng), 0.3, 0.55))
+    image = ramp(
+        np.clip(0.5 + 0.2 * noise(rng, n, 1.7) + 0.4 * (v - 0.5), 0, 1),
+        _hsv(pick_hue(rng), 0.35, 0.22),
+        _hsv(pick_hue(rng), 0.3, 0.55),
+    )
     vase = (np.abs(u - 0.5) < 0.09 + 0.05 * np.sin(9 * v)) & (v > 0.62) & (v < 0.93)
     image[vase] = _hsv(pick_hue(rng), 0.3, 0.75)
     for _ in range(26):
         cx, cy, r = rng.normal(0.5, 0.16), rng.normal(0.38, 0.12), rng.uniform(0.03, 0.09)
         petals = int(rng.integers(4, 8))
-        colour = _hsv(float(rng.choice([0.0, 0.05, 0.12, 0.3, 0.33, 0.95])), rng.uniform(0.4, 0.85), rng.uniform(0.5, 0.97))
-        window = (slice(max(0, int((cy - r) * n)), max(0, int((cy + r) * n) + 1)), slice(max(0, int((cx - r) * n)), max(0, int((cx + r) * n) + 1)))
+        colour = _hsv(
+            float(rng.choice([0.0, 0.05, 0.12, 0.3, 0.33, 0.95])), rng.uniform(0.4, 0.85), rng.uniform(0.5, 0.97)
+        )
+        window = (
+            slice(max(0, int((cy - r) * n)), max(0, int((cy + r) * n) + 1)),
+            slice(max(0, int((cx - r) * n)), max(0, int((cx + r) * n) + 1)),
+        )
         du, dv = u[window] - cx, v[window] - cy
         a, d = np.arctan2(dv, du), np.hypot(du, dv) / r
-        flower = blend(image[window], colour, smooth(0, 0.1, 0.75 + 0.25 * np.cos(petals * a) - d) * (0.65 + 0.35 * np.clip(d, 0, 1)))
+        flower = blend(
+            image[window],
+            colour,
+            smooth(0, 0.1, 0.75 + 0.25 * np.cos(petals * a) - d) * (0.65 + 0.35 * np.clip(d, 0, 1)),
+        )
         image[window] = blend(flower, colour * 0.4, smooth(0, 0.1, 0.25 - d))
     return shade(image, 1 + 0.08 * noise(rng, n, 0.6, stretch=(3, 1), low=8))
 
@@ -198,7 +217,12 @@ def rug(rng: np.random.Generator, n: int, *, ground: Colour, figure: Colour, acc
     image = blend(image, accent, smooth(0.03, 0.0, np.abs(medal)))
     image = blend(image, figure, smooth(0.0, 0.02, -medal - 0.15) * 0.6)
     image = blend(image, ground, smooth(0.2, 0.3, np.sin(3 * field) - 0.4) * (medal < -0.05))
-    for low, high, colour in ((0.78, 0.8, accent), (0.8, 0.92, figure), (0.92, 0.94, accent), (0.94, 1.0, np.asarray(ground) * 0.5)):
+    for low, high, colour in (
+        (0.78, 0.8, accent),
+        (0.8, 0.92, figure),
+        (0.92, 0.94, accent),
+        (0.94, 1.0, np.asarray(ground) * 0.5),
+    ):
         image = blend(image, colour, ((edge >= low) & (edge < high)).astype(np.float32))
     along = np.where(x > y, v, u)
     zig = np.abs(((along * 28) % 1) - 0.5) * 0.2 + 0.81
@@ -219,7 +243,13 @@ def screen(rng: np.random.Generator, n: int) -> np.ndarray:
         for k in range(3):
             ink = _hsv(rng.random(), 0.5, 0.85 if dark else 0.35)
             top = r + n // 20 + k * h // 3
-            _text(rng, image, (top, min(top + h // 3 - 4, r + h, n), c + n // 40, min(c + w, n)), ink, height=max(2, n // 90))
+            _text(
+                rng,
+                image,
+                (top, min(top + h // 3 - 4, r + h, n), c + n // 40, min(c + w, n)),
+                ink,
+                height=max(2, n // 90),
+            )
     return image
 
 
@@ -237,6 +267,12 @@ def labels(rng: np.random.Generator, n: int) -> np.ndarray:
         size = int(m * rng.uniform(0.45, 0.7))
         top, left = int(m * 0.32), (m - size) // 2
         cell[top : top + size, left : left + size] = motif[k % 3](rng, size)[: m - top]
-        _text(rng, cell, (int(m * 0.06), int(m * 0.3), int(m * 0.08), int(m * 0.95)), _hsv((hue + 0.5) % 1, 0.7, 0.25), height=max(3, m // 9))
+        _text(
+            rng,
+            cell,
+            (int(m * 0.06), int(m * 0.3), int(m * 0.08), int(m * 0.95)),
+            _hsv((hue + 0.5) % 1, 0.7, 0.25),
+            height=max(3, m // 9),
+        )
         _text(rng, cell, (int(m * 0.86), m, int(m * 0.1), int(m * 0.9)), (0.1, 0.1, 0.1), height=max(2, m // 40))
     return shade(image, 1 + 0.05 * noise(rng, n, 1.0, low=6))

@@ -18,7 +18,9 @@ def pick(rng: np.random.Generator, items: tuple) -> Material:
     return items[int(rng.integers(len(items)))]
 
 
-def vessel(b: MeshBuilder, material: Material, outer: list[tuple[float, float]], *, wall: float = 0.006, segments: int = 24) -> None:
+def vessel(
+    b: MeshBuilder, material: Material, outer: list[tuple[float, float]], *, wall: float = 0.006, segments: int = 24
+) -> None:
     """A hollow body of revolution: outer profile (radius, z) from the foot to the rim, then down inside."""
     inner = [(max(r - wall, 0.0), max(z, outer[0][1] + wall)) for r, z in outer[::-1]]
     inner[0] = (max(outer[-1][0] - wall, 0.0), outer[-1][1])
@@ -36,7 +38,11 @@ def vase(b: MeshBuilder, look: Look, rng: np.random.Generator, height: float = 0
 def bowl(b: MeshBuilder, look: Look, rng: np.random.Generator, radius: float = 0.13) -> None:
     """An open bowl, half of the time with fruit."""
     t = np.linspace(0.25, 1, b.segments(8, 4))
-    vessel(b, pick(rng, look.shared.vases), [(float(radius * math.sin(x * 1.45)), float(radius * 0.55 * (x - 0.25) ** 1.6)) for x in t])
+    vessel(
+        b,
+        pick(rng, look.shared.vases),
+        [(float(radius * math.sin(x * 1.45)), float(radius * 0.55 * (x - 0.25) ** 1.6)) for x in t],
+    )
     for _ in range(int(rng.integers(0, 5)) if b.detail > 0.5 else 0):
         angle, away = rng.uniform(0, 2 * math.pi), rng.uniform(0.3, 0.5) * radius
         with b.placed(away * math.cos(angle), away * math.sin(angle), 0.3 * radius):
@@ -52,8 +58,12 @@ def ball(b: MeshBuilder, material: Material, radius: float) -> None:
 def basket(b: MeshBuilder, look: Look, rng: np.random.Generator, radius: float = 0.2, height: float = 0.35) -> None:
     """A wicker basket, open above."""
     del rng
-    vessel(b, look.shared.wicker, [(radius * 0.78, 0.0), (radius * 0.9, height * 0.4), (radius, height * 0.95), (radius * 1.04, height)],
-           wall=0.015)
+    vessel(
+        b,
+        look.shared.wicker,
+        [(radius * 0.78, 0.0), (radius * 0.9, height * 0.4), (radius, height * 0.95), (radius * 1.04, height)],
+        wall=0.015,
+    )
 
 
 def mug(b: MeshBuilder, look: Look, rng: np.random.Generator) -> None:
@@ -130,9 +140,9 @@ def jar(b: MeshBuilder, look: Look, rng: np.random.Generator) -> None:
 def lamp(b: MeshBuilder, look: Look, rng: np.random.Generator, height: float = 1.55) -> None:
     """Floor or table lamp: foot, thin stand, shade open above and below, bulb."""
     top = height
-    tall = 0.22 * height ** 0.5
-    wide, narrow = 0.17 * height ** 0.4, float(rng.uniform(0.09, 0.15)) * height ** 0.4
-    foot = 0.14 * height ** 0.5
+    tall = 0.22 * height**0.5
+    wide, narrow = 0.17 * height**0.4, float(rng.uniform(0.09, 0.15)) * height**0.4
+    foot = 0.14 * height**0.5
     if height > 1:
         b.revolve(look.shared.iron, [(0, 0), (foot, 0), (foot, 0.015), (0.03, 0.03), (0, 0.03)])
         b.tube(look.shared.iron, [(0, 0, 0.02), (0, 0, height / 2), (0, 0, top - tall * 0.5)], 0.011)
@@ -141,12 +151,19 @@ def lamp(b: MeshBuilder, look: Look, rng: np.random.Generator, height: float = 1
             vase(b, look, rng, top - tall)
         b.tube(look.shared.iron, [(0, 0, 0.6 * (top - tall)), (0, 0, top - tall * 0.5)], 0.008)
     low = top - tall
-    b.revolve(look.shade, [(wide, low), (narrow, top), (narrow - 0.004, top), (wide - 0.004, low), (wide, low)], segments=32)
+    b.revolve(
+        look.shade, [(wide, low), (narrow, top), (narrow - 0.004, top), (wide - 0.004, low), (wide, low)], segments=32
+    )
     with b.placed(0, 0, top - tall * 0.5):
         ball(b, look.shared.ceramic, 0.035)
     for k in range(3):
         a = 2 * math.pi * k / 3
-        b.tube(look.shared.iron, [(0, 0, top - 0.03), (narrow * math.cos(a), narrow * math.sin(a), top - 0.01)], 0.003, segments=5)
+        b.tube(
+            look.shared.iron,
+            [(0, 0, top - 0.03), (narrow * math.cos(a), narrow * math.sin(a), top - 0.01)],
+            0.003,
+            segments=5,
+        )
 
 
 def pendant(b: MeshBuilder, look: Look, rng: np.random.Generator, ceiling: float, bottom: float) -> None:
@@ -156,7 +173,7 @@ def pendant(b: MeshBuilder, look: Look, rng: np.random.Generator, ceiling: float
     b.revolve(look.shared.iron, [(0, ceiling - 0.03), (0.05, ceiling - 0.03), (0.055, ceiling)], segments=16)
     b.tube(look.shared.iron, [(0, 0, ceiling), (0, 0, bottom + height)], 0.006, segments=6)
     t = np.linspace(0, 1, b.segments(8, 4))
-    outer = [(float(radius * (1 - x ** 2.2) + 0.03), float(bottom + x * height)) for x in t]
+    outer = [(float(radius * (1 - x**2.2) + 0.03), float(bottom + x * height)) for x in t]
     b.revolve(material, [*outer, *[(max(r - 0.006, 0), z - 0.004) for r, z in outer[::-1]]], segments=32)
     with b.placed(0, 0, bottom + 0.45 * height):
         ball(b, look.shared.ceramic, 0.05)
@@ -165,34 +182,60 @@ def pendant(b: MeshBuilder, look: Look, rng: np.random.Generator, ceiling: float
 def plant(b: MeshBuilder, look: Look, rng: np.random.Generator, height: float = 1.1) -> None:
     """Potted plant: vessel, soil, arching stems with thin folded leaves."""
     pot = 0.26 * height
-    r = 0.16 * height ** 0.6 if height < 0.6 else 0.17
+    r = 0.16 * height**0.6 if height < 0.6 else 0.17
     material = look.shared.wicker if rng.random() < 0.3 else pick(rng, look.shared.vases)
-    vessel(b, material, [(0.7 * r, 0), (0.85 * r, 0.5 * pot), (r, 0.92 * pot), (1.06 * r, 0.93 * pot), (1.06 * r, pot)], wall=0.012)
+    vessel(
+        b,
+        material,
+        [(0.7 * r, 0), (0.85 * r, 0.5 * pot), (r, 0.92 * pot), (1.06 * r, 0.93 * pot), (1.06 * r, pot)],
+        wall=0.012,
+    )
     b.revolve(look.shared.soil, [(0.97 * r, 0.88 * pot), (0, 0.9 * pot)], segments=16)
     leaf_material = look.shared.leaf if rng.random() < 0.6 else look.shared.leaf2
     palm = rng.random() < 0.4
-    count = max(5, int((26 if height > 0.6 else 16) * b.detail ** 0.5))
+    count = max(5, int((26 if height > 0.6 else 16) * b.detail**0.5))
     for k in range(count):
         turn = 2.4 * k + float(rng.normal(0, 0.2))
         rise = float(rng.uniform(0.35, 1.0)) * (height - pot)
-        reach = float(rng.uniform(0.10, 0.20)) * height ** 0.7
+        reach = float(rng.uniform(0.10, 0.20)) * height**0.7
         with b.placed(0, 0, 0.88 * pot, yaw=turn):
             if palm:
                 _blade(b, leaf_material, (0.01, 0.0), (reach * 1.6, rise), width=0.035 + 0.02 * height, length=1.0)
             else:
-                b.tube(leaf_material, [(0.01, 0, 0), (0.35 * reach, 0, 0.6 * rise), (0.75 * reach, 0, 0.92 * rise)], 0.004, segments=5)
-                _blade(b, leaf_material, (0.75 * reach, 0.92 * rise), (0.75 * reach + 0.2 * height ** 0.6, 0.92 * rise),
-                       width=float(rng.uniform(0.05, 0.09)) * height ** 0.5, length=0.5)
+                b.tube(
+                    leaf_material,
+                    [(0.01, 0, 0), (0.35 * reach, 0, 0.6 * rise), (0.75 * reach, 0, 0.92 * rise)],
+                    0.004,
+                    segments=5,
+                )
+                _blade(
+                    b,
+                    leaf_material,
+                    (0.75 * reach, 0.92 * rise),
+                    (0.75 * reach + 0.2 * height**0.6, 0.92 * rise),
+                    width=float(rng.uniform(0.05, 0.09)) * height**0.5,
+                    length=0.5,
+                )
 
 
 def _blade(
-    b: MeshBuilder, material: Material, start: tuple[float, float], end: tuple[float, float], *, width: float, length: float
+    b: MeshBuilder,
+    material: Material,
+    start: tuple[float, float],
+    end: tuple[float, float],
+    *,
+    width: float,
+    length: float,
 ) -> None:
     """One leaf in the x-z plane from start to end, arched, folded along its midrib."""
     n = b.segments(7, 4)
     t = np.linspace(0, 1, n)
     x = start[0] + (end[0] - start[0]) * t ** (1.0 if length < 1 else 1.5)
-    z = start[1] + (end[1] - start[1]) * np.sin(t * math.pi / 2) + (0.10 * np.sin(t * 3.3) - 0.12 * t * t) * (0.6 if length < 1 else 2) * 0.5
+    z = (
+        start[1]
+        + (end[1] - start[1]) * np.sin(t * math.pi / 2)
+        + (0.10 * np.sin(t * 3.3) - 0.12 * t * t) * (0.6 if length < 1 else 2) * 0.5
+    )
     half = width * np.sqrt(np.clip(np.sin(math.pi * (0.04 + 0.94 * t)), 0, 1))
     points = np.stack([np.stack([x, s * half, z + 0.35 * abs(s) * half], -1) for s in (-1, 0, 1)])
     uv = np.stack([np.stack([np.full(n, u), t], -1) for u in (0.02, 0.5, 0.98)])
@@ -212,7 +255,9 @@ def picture(b: MeshBuilder, look: Look, rng: np.random.Generator, index: int, wi
     b.quad(look.shared.paper, [(x, y, -z), (-x, y, -z), (-x, y, z), (x, y, z)])
     border = 0.0 if rng.random() < 0.4 else 0.12 * min(width, height)
     x, z, y = x - border, z - border, y + 0.002
-    b.quad(look.shared.paintings, [(x, y, -z), (-x, y, -z), (-x, y, z), (x, y, z)], cell_uv(PAINTINGS, index, margin=0.02))
+    b.quad(
+        look.shared.paintings, [(x, y, -z), (-x, y, -z), (-x, y, z), (x, y, z)], cell_uv(PAINTINGS, index, margin=0.02)
+    )
 
 
 def curtain(b: MeshBuilder, look: Look, rng: np.random.Generator, width: float, height: float) -> None:
@@ -263,7 +308,14 @@ def towel(b: MeshBuilder, look: Look, material: Material, width: float, length: 
     y = np.sign(t) * (0.012 + 0.012 * over) * np.clip(np.abs(t) / 0.12, 0, 1)
     z = 0.016 - over * np.where(t > 0, length, 0.7 * length)
     wave = 0.006 * np.sin(14 * s)[:, None] * over[None] * np.sign(t)[None]
-    points = np.stack([np.broadcast_to(s[:, None] * width, (len(s), len(t))), y[None] + wave, np.broadcast_to(z[None], (len(s), len(t)))], -1)
+    points = np.stack(
+        [
+            np.broadcast_to(s[:, None] * width, (len(s), len(t))),
+            y[None] + wave,
+            np.broadcast_to(z[None], (len(s), len(t))),
+        ],
+        -1,
+    )
     b.grid(material, points)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from active3d_pipe.sim import apartment_decor as decor
 from active3d_pipe.sim import apartment_fittings as fit
 from active3d_pipe.sim import apartment_furniture as fur
+from active3d_pipe.sim import apartment_storage as sto
 from active3d_pipe.sim.apartment_layout import HEIGHT, Room
 from active3d_pipe.sim.apartment_look import Look
 from active3d_pipe.sim.apartment_mesh import MeshBuilder
@@ -27,8 +28,13 @@ class Furnisher:
 
     def furnish(self) -> None:
         """Everything: furniture by type of room, then pictures and the ceiling lamp."""
-        {"living": self.living, "kitchen": self.kitchen, "bedroom": self.bedroom, "study": self.study, "bath": self.bath}[
-            self.room.kind]()
+        {
+            "living": self.living,
+            "kitchen": self.kitchen,
+            "bedroom": self.bedroom,
+            "study": self.study,
+            "bath": self.bath,
+        }[self.room.kind]()
         self.pictures(1 if self.room.kind == "bath" else int(self.rng.integers(3, 6)))
         x, y, bottom = self.light
         with self.b.placed(x, y):
@@ -97,7 +103,7 @@ class Furnisher:
                     stand = Floor.shift(bed, s * (width / 2 + 0.3), 0)
                     if self.floor.take(stand, 0.44, 0.4, margin=0.0):
                         with at(b, stand):
-                            fur.drawers(b, look, look.wood, 0.44, 0.4, 0.5, 2)
+                            sto.drawers(b, look, look.wood, 0.44, 0.4, 0.5, 2)
                             with b.placed(0, 0.18, 0.5):
                                 decor.lamp(b, look, rng, 0.48)
                 break
@@ -105,7 +111,7 @@ class Furnisher:
             spot = self.floor.wall(width + 0.06, 0.62, 2.15, prefer="corner")
             if spot:
                 with at(b, spot):
-                    fur.wardrobe(b, look, width, 0.6, 2.12)
+                    sto.wardrobe(b, look, width, 0.6, 2.12)
                 break
         self.sideboard()
         self.shelves(1, width=0.8, height=1.8)
@@ -162,7 +168,7 @@ class Furnisher:
         if spot:
             with at(b, spot):
                 fit.towel_rail(b, look, 0.5)
-        self.shelves(1, width=0.6, height=1.5)
+        self.shelves(1, width=0.6, height=1.5, books=False)
         self.corners(("basket", "plant"))
 
     def rug(self, spot: Spot, width: float, depth: float) -> None:
@@ -178,7 +184,9 @@ class Furnisher:
         with self.b.placed(x, y, 0, yaw=spot[2]):
             w, d, t = width / 2, depth / 2, 0.009
             self.b.box(self.look.fabric3, (-w, -d, 0.001), (w, d, t - 0.001))
-            self.b.quad(self.look.rug, [(-w, -d, t), (w, -d, t), (w, d, t), (-w, d, t)], [(0, 0), (1, 0), (1, 1), (0, 1)])
+            self.b.quad(
+                self.look.rug, [(-w, -d, t), (w, -d, t), (w, d, t), (-w, d, t)], [(0, 0), (1, 0), (1, 1), (0, 1)]
+            )
 
     def tv(self, near: Spot) -> None:
         """Television on a low board."""
@@ -187,8 +195,10 @@ class Furnisher:
             with at(self.b, spot):
                 fur.tv_unit(self.b, self.look, self.rng, 1.46, 0.4)
 
-    def shelves(self, count: int, *, width: float = 0.9, height: float = 2.0, prefer: str = "any") -> None:
-        """Book shelves along the walls."""
+    def shelves(
+        self, count: int, *, width: float = 0.9, height: float = 2.0, prefer: str = "any", books: bool = True
+    ) -> None:
+        """Shelves along the walls, with books or only with other things."""
         near = None
         for _ in range(count):
             tall = height * float(self.rng.uniform(0.75, 1.05))
@@ -197,7 +207,7 @@ class Furnisher:
                 return
             near = spot if self.rng.random() < 0.5 else None
             with at(self.b, spot):
-                fur.bookshelf(self.b, self.look, self.rng, width - 0.03, 0.3, tall, max(3, round(tall / 0.36)))
+                sto.bookshelf(self.b, self.look, self.rng, width - 0.03, 0.3, tall, max(3, round(tall / 0.36)), books)
 
     def sideboard(self) -> None:
         """A chest of drawers with a lamp and things on it."""
@@ -207,7 +217,7 @@ class Furnisher:
             return
         with at(self.b, spot):
             body = self.look.paint if self.rng.random() < 0.6 else self.look.wood
-            fur.drawers(self.b, self.look, body, width, 0.43, 0.85, 3, 2 if width > 0.9 else 1)
+            sto.drawers(self.b, self.look, body, width, 0.43, 0.85, 3, 2 if width > 0.9 else 1)
             with self.b.placed(-0.3 * width, 0.2, 0.85):
                 decor.lamp(self.b, self.look, self.rng, 0.5)
             with self.b.placed(0.1 * width, 0.22, 0.85):
@@ -222,7 +232,9 @@ class Furnisher:
             if places > chairs and width > 1.2:
                 continue
             side = 0.42  # the chairs stand pushed in by half
-            spot = self.floor.free(width + (0.1 if places == 4 else 2 * side), depth + (2 * side if places == 4 else 0.05), yaws=QUARTERS)
+            spot = self.floor.free(
+                width + (0.1 if places == 4 else 2 * side), depth + (2 * side if places == 4 else 0.05), yaws=QUARTERS
+            )
             if spot is None:
                 continue
             inset = side if places == 4 else 0.025
@@ -230,7 +242,12 @@ class Furnisher:
             style = int(rng.integers(3))
             with at(b, corner):
                 fur.table(b, look, rng, width, depth, 0.75)
-            seats = [(-width / 4, -0.36, 0.0), (width / 4, -0.36, 0.0), (-width / 4, depth + 0.36, math.pi), (width / 4, depth + 0.36, math.pi)]
+            seats = [
+                (-width / 4, -0.36, 0.0),
+                (width / 4, -0.36, 0.0),
+                (-width / 4, depth + 0.36, math.pi),
+                (width / 4, depth + 0.36, math.pi),
+            ]
             if places == 2:
                 seats = [(-width / 2 - 0.38, depth / 2, -math.pi / 2), (width / 2 + 0.38, depth / 2, math.pi / 2)]
             for x, y, turn in seats:

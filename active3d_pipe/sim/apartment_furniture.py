@@ -11,14 +11,7 @@ import numpy as np
 from active3d_pipe.sim import apartment_decor as decor
 from active3d_pipe.sim.apartment_look import Look
 from active3d_pipe.sim.apartment_mesh import Material, MeshBuilder
-
-
-def legs(b: MeshBuilder, material: Material, width: float, depth: float, height: float, *, thick: float = 0.04, inset: float = 0.03) -> None:
-    """Four tapered round legs under a plate (width, depth) whose back edge is y = 0."""
-    for sx in (-1, 1):
-        for y in (inset, depth - inset):
-            with b.placed(sx * (width / 2 - inset), y):
-                b.revolve(material, [(0, 0), (0.35 * thick, 0), (0.5 * thick, height)], segments=10)
+from active3d_pipe.sim.apartment_storage import drawers, front, legs
 
 
 def sofa(b: MeshBuilder, look: Look, rng: np.random.Generator, width: float, depth: float, seats: int) -> None:
@@ -34,9 +27,13 @@ def sofa(b: MeshBuilder, look: Look, rng: np.random.Generator, width: float, dep
     for k in range(seats):
         x = -width / 2 + arm + k * each
         with b.placed():
-            b.cushion(look.fabric, (x + 0.005, 0.18, 0.29), (x + each - 0.005, depth, seat + 0.03), radius=0.05, bulge=0.02)
+            b.cushion(
+                look.fabric, (x + 0.005, 0.18, 0.29), (x + each - 0.005, depth, seat + 0.03), radius=0.05, bulge=0.02
+            )
         with b.placed(x + each / 2, 0.19, seat + 0.02, tilt=-0.2):
-            b.cushion(look.fabric, (-each / 2 + 0.01, 0, 0), (each / 2 - 0.01, 0.15, back - seat), radius=0.06, bulge=0.025)
+            b.cushion(
+                look.fabric, (-each / 2 + 0.01, 0, 0), (each / 2 - 0.01, 0.15, back - seat), radius=0.06, bulge=0.025
+            )
     for k in range(max(1, seats)):
         x = float(rng.uniform(-0.5, 0.5)) * (width - 2 * arm - 0.35)
         with b.placed(x, 0.42, seat + 0.05, yaw=float(rng.normal(0, 0.25)), tilt=-0.45):
@@ -49,9 +46,18 @@ def _throw(b: MeshBuilder, material: Material, x0: float, x1: float, depth: floa
     """A blanket over a sofa's arm."""
     n = b.segments(10, 6)
     y = np.linspace(0.35, min(depth - 0.1, 0.8), n)
-    path = np.array([(x0, 0.2), (x0, 0.45), (x0 - 0.002, 0.6), (x0 + 0.03, 0.625), (x1 - 0.03, 0.625), (x1, 0.6), (x1, 0.47)])
-    wave = 0.012 * np.sin(np.linspace(0, 9, n) + float(rng.uniform(0, 6)))[:, None] * np.array([1, 0.6, 0.1, 0, 0, 0.1, 0.3])[None]
-    points = np.stack([path[None, :, 0] - np.abs(wave), np.broadcast_to(y[:, None], (n, 7)), path[None, :, 1] + 0.3 * np.abs(wave)], -1)
+    path = np.array(
+        [(x0, 0.2), (x0, 0.45), (x0 - 0.002, 0.6), (x0 + 0.03, 0.625), (x1 - 0.03, 0.625), (x1, 0.6), (x1, 0.47)]
+    )
+    wave = (
+        0.012
+        * np.sin(np.linspace(0, 9, n) + float(rng.uniform(0, 6)))[:, None]
+        * np.array([1, 0.6, 0.1, 0, 0, 0.1, 0.3])[None]
+    )
+    points = np.stack(
+        [path[None, :, 0] - np.abs(wave), np.broadcast_to(y[:, None], (n, 7)), path[None, :, 1] + 0.3 * np.abs(wave)],
+        -1,
+    )
     b.grid(material, points)
 
 
@@ -70,13 +76,26 @@ def chair(b: MeshBuilder, look: Look, rng: np.random.Generator, style: int) -> N
         return
     b.cushion(wood, (-w / 2, 0.015, seat - 0.02), (w / 2, d, seat + 0.012), radius=0.012)
     for z in (0.62, 0.75, 0.88) if style == 2 else (0.88,):
-        b.box(wood, (-w / 2 + 0.03, -0.012 - 0.05 * (z - 0.7), z - 0.025), (w / 2 - 0.03, 0.008 - 0.05 * (z - 0.7), z + 0.03))
+        b.box(
+            wood,
+            (-w / 2 + 0.03, -0.012 - 0.05 * (z - 0.7), z - 0.025),
+            (w / 2 - 0.03, 0.008 - 0.05 * (z - 0.7), z + 0.03),
+        )
     if style == 0:
         for x in np.linspace(-0.15, 0.15, 5):
             b.tube(wood, [(x, 0.03, seat), (x, 0.015, 0.7), (x, -0.01, 0.87)], 0.008, segments=6)
 
 
-def table(b: MeshBuilder, look: Look, rng: np.random.Generator, width: float, depth: float, height: float, *, shelf: bool = False) -> None:
+def table(
+    b: MeshBuilder,
+    look: Look,
+    rng: np.random.Generator,
+    width: float,
+    depth: float,
+    height: float,
+    *,
+    shelf: bool = False,
+) -> None:
     """Rectangular table with thin legs and an apron; `shelf` adds a board below (coffee tables)."""
     legs(b, look.wood, width, depth, height - 0.03, thick=0.05, inset=0.045)
     b.cushion(look.wood, (-width / 2, 0, height - 0.03), (width / 2, depth, height), radius=0.01, steps=2)
@@ -106,7 +125,10 @@ def table_top(b: MeshBuilder, look: Look, rng: np.random.Generator) -> None:
     elif kind == 2:
         decor.book_stack(b, look, rng, int(rng.integers(1, 4)))
     else:
-        b.revolve(look.shared.vases[kind - 3], [(0, 0.004), (0.06, 0.004), (0.12, 0.016), (0.122, 0.02), (0.06, 0.009), (0, 0.009)])
+        b.revolve(
+            look.shared.vases[kind - 3],
+            [(0, 0.004), (0.06, 0.004), (0.12, 0.016), (0.122, 0.02), (0.06, 0.009), (0, 0.009)],
+        )
         with b.placed(0.17, 0.05):
             decor.mug(b, look, rng)
 
@@ -116,11 +138,19 @@ def bed(b: MeshBuilder, look: Look, rng: np.random.Generator, width: float, leng
     x, top = width / 2, 0.5
     b.box(look.wood, (-x, 0.05, 0.14), (x, length, 0.3))
     legs(b, look.wood, width, length, 0.15, thick=0.07, inset=0.08)
-    b.cushion(look.wood2 if rng.random() < 0.5 else look.fabric, (-x - 0.02, 0, 0.14), (x + 0.02, 0.06, 1.05), radius=0.025)
+    b.cushion(
+        look.wood2 if rng.random() < 0.5 else look.fabric, (-x - 0.02, 0, 0.14), (x + 0.02, 0.06, 1.05), radius=0.025
+    )
     panels = 4
     for k in range(panels):
         w = width / panels
-        b.cushion(look.fabric, (-x + k * w + 0.008, 0.05, 0.5), (-x + (k + 1) * w - 0.008, 0.09, 1.0), radius=0.018, bulge=0.02)
+        b.cushion(
+            look.fabric,
+            (-x + k * w + 0.008, 0.05, 0.5),
+            (-x + (k + 1) * w - 0.008, 0.09, 1.0),
+            radius=0.018,
+            bulge=0.02,
+        )
     b.cushion(look.shade, (-x + 0.02, 0.08, 0.29), (x - 0.02, length - 0.02, top), radius=0.05)
     count = 2 if width > 1.2 else 1
     for k in range(count):
@@ -132,7 +162,9 @@ def bed(b: MeshBuilder, look: Look, rng: np.random.Generator, width: float, leng
     _blanket(b, look, rng, x, 0.62, length, top)
 
 
-def _blanket(b: MeshBuilder, look: Look, rng: np.random.Generator, x: float, start: float, stop: float, top: float) -> None:
+def _blanket(
+    b: MeshBuilder, look: Look, rng: np.random.Generator, x: float, start: float, stop: float, top: float
+) -> None:
     n, m = b.segments(44, 14), b.segments(48, 14)
     drop = 0.26
     s, t = np.linspace(-x - drop, x + drop, n), np.linspace(start, stop + drop, m)
@@ -140,8 +172,11 @@ def _blanket(b: MeshBuilder, look: Look, rng: np.random.Generator, x: float, sta
     over_x, over_y = np.clip(np.abs(S) - x, 0, None), np.clip(Y - stop, 0, None)
     down = np.maximum(over_x, over_y)
     field = sum(
-        a * np.sin(fx * S + fy * Y + p) for a, fx, fy, p in zip(
-            (0.012, 0.009, 0.006, 0.004), rng.normal(0, 9, 4), rng.normal(0, 11, 4), rng.uniform(0, 6, 4)))
+        a * np.sin(fx * S + fy * Y + p)
+        for a, fx, fy, p in zip(
+            (0.012, 0.009, 0.006, 0.004), rng.normal(0, 9, 4), rng.normal(0, 11, 4), rng.uniform(0, 6, 4)
+        )
+    )
     folds = 0.018 * np.sin(26 * (S + Y) + float(rng.uniform(0, 6)))
     bulge = 0.012 + np.abs(field) + np.where(down > 0, 0.012 + np.abs(folds) * np.clip(down / 0.15, 0, 1), 0)
     px = np.sign(S) * (np.minimum(np.abs(S), x) + np.where(over_x > 0, bulge, 0))
@@ -150,86 +185,16 @@ def _blanket(b: MeshBuilder, look: Look, rng: np.random.Generator, x: float, sta
     b.grid(look.fabric2, np.stack([px, py, pz], -1))
     k = b.segments(14, 6)
     u = np.linspace(0, 1, k)
-    profile = np.stack([start - 0.01 + 0.26 * u, top + 0.03 + 0.035 * np.sin(math.pi * np.clip(u * 3, 0, 1) / 2) * (1 - 0.5 * u)], -1)
+    profile = np.stack(
+        [start - 0.01 + 0.26 * u, top + 0.03 + 0.035 * np.sin(math.pi * np.clip(u * 3, 0, 1) / 2) * (1 - 0.5 * u)], -1
+    )
     px2 = np.linspace(-x - 0.015, x + 0.015, n)
     wave = 0.008 * np.sin(17 * px2 + 1)[:, None]
-    fold = np.stack([np.broadcast_to(px2[:, None], (n, k)), profile[None, :, 0] + wave, profile[None, :, 1] + 0.5 * np.abs(wave)], -1)
+    fold = np.stack(
+        [np.broadcast_to(px2[:, None], (n, k)), profile[None, :, 0] + wave, profile[None, :, 1] + 0.5 * np.abs(wave)],
+        -1,
+    )
     b.grid(look.shade, fold)
-
-
-def front(b: MeshBuilder, material: Material, handle: Material, low: tuple[float, float], high: tuple[float, float], y: float, *, knob: str = "bar") -> None:
-    """A door or drawer front on the plane y from (x, z) low to high: raised frame around a recess, and a handle."""
-    (x0, z0), (x1, z1) = low, high
-    g = 0.004
-    x0, x1, z0, z1 = x0 + g, x1 - g, z0 + g, z1 - g
-    b.box(material, (x0, y, z0), (x1, y + 0.012, z1), skip=("-y",))
-    f = min(0.06, 0.22 * min(x1 - x0, z1 - z0))
-    for lo, hi in (((x0, z0), (x1, z0 + f)), ((x0, z1 - f), (x1, z1)), ((x0, z0 + f), (x0 + f, z1 - f)), ((x1 - f, z0 + f), (x1, z1 - f))):
-        b.box(material, (lo[0], y + 0.012, lo[1]), (hi[0], y + 0.022, hi[1]), skip=("-y",))
-    xm, zm = (x0 + x1) / 2, (z0 + z1) / 2
-    if knob == "bar":
-        b.tube(handle, [(xm - 0.06, y + 0.02, z1 - f / 2), (xm - 0.06, y + 0.045, z1 - f / 2), (xm + 0.06, y + 0.045, z1 - f / 2),
-                        (xm + 0.06, y + 0.02, z1 - f / 2)], 0.005, segments=6)
-        return
-    x = {"left": x0 + f / 2, "right": x1 - f / 2}.get(knob, xm)
-    with b.placed(x, y + 0.038, zm):
-        decor.ball(b, handle, 0.016)
-
-
-def drawers(b: MeshBuilder, look: Look, body: Material, width: float, depth: float, height: float, rows: int, cols: int = 1) -> None:
-    """Chest of drawers on short legs."""
-    legs(b, look.wood2, width, depth, 0.1, thick=0.045, inset=0.05)
-    b.box(body, (-width / 2, 0, 0.1), (width / 2, depth - 0.025, height - 0.025))
-    b.cushion(look.wood2, (-width / 2 - 0.012, 0, height - 0.025), (width / 2 + 0.012, depth, height), radius=0.008, steps=2)
-    dx, dz = (width - 0.02) / cols, (height - 0.15) / rows
-    for i in range(cols):
-        for j in range(rows):
-            x, z = -width / 2 + 0.01 + i * dx, 0.115 + j * dz
-            front(b, body, look.shared.metal, (x, z), (x + dx, z + dz), depth - 0.025)
-
-
-def wardrobe(b: MeshBuilder, look: Look, width: float, depth: float, height: float) -> None:
-    """Wardrobe with panelled doors, plinth and cornice."""
-    body = look.paint
-    b.box(body, (-width / 2, 0, 0.07), (width / 2, depth - 0.03, height - 0.05))
-    b.box(look.wood, (-width / 2 + 0.02, 0, 0), (width / 2 - 0.02, depth - 0.06, 0.07))
-    b.cushion(look.wood, (-width / 2 - 0.03, 0, height - 0.05), (width / 2 + 0.03, depth + 0.02, height), radius=0.015, steps=2)
-    count = max(2, round(width / 0.5))
-    w = width / count
-    for k in range(count):
-        x = -width / 2 + k * w
-        knob = "right" if k % 2 == 0 else "left"
-        front(b, body, look.shared.metal, (x, 0.6), (x + w, height - 0.06), depth - 0.03, knob=knob)
-        front(b, body, look.shared.metal, (x, 0.08), (x + w, 0.6), depth - 0.03)
-
-
-def bookshelf(b: MeshBuilder, look: Look, rng: np.random.Generator, width: float, depth: float, height: float, boards: int) -> None:
-    """Open shelf with books and things; back panel, sides, boards."""
-    wood, t = look.wood, 0.022
-    b.box(wood, (-width / 2, 0, 0), (width / 2, 0.012, height))
-    for s in (-1, 1):
-        low, high = sorted((s * width / 2, s * (width / 2 - t)))
-        b.box(wood, (low, 0, 0), (high, depth, height))
-    pitch = (height - 0.08 - t) / boards
-    for k in range(boards + 1):
-        z = 0.06 + k * pitch
-        b.box(wood, (-width / 2 + t, 0.012, z), (width / 2 - t, depth - 0.005, z + t))
-        if k == boards:
-            break
-        clear = pitch - t - 0.02
-        x0, x1 = -width / 2 + t + 0.005, width / 2 - t - 0.005
-        cut = x0 + float(rng.choice([0.45, 0.65, 1.0, 1.0])) * (x1 - x0)
-        books_left = bool(rng.random() < 0.5)
-        lo, hi = (x0, cut) if books_left else (x1 - (cut - x0), x1)
-        with b.placed(0, 0.04, z + t):
-            decor.book_row(b, look, rng, lo, hi, depth - 0.09, clear)
-        gap = (hi, x1) if books_left else (x0, lo)
-        if gap[1] - gap[0] > 0.2:
-            with b.placed((gap[0] + gap[1]) / 2, depth / 2, z + t):
-                decor.ornament(b, look, rng, clear)
-    for x in (-0.25 * width, 0.22 * width):
-        with b.placed(x, depth / 2, 0.06 + boards * pitch + t):
-            decor.ornament(b, look, rng, 0.28)
 
 
 def desk(b: MeshBuilder, look: Look, rng: np.random.Generator, width: float, depth: float) -> None:
@@ -237,14 +202,18 @@ def desk(b: MeshBuilder, look: Look, rng: np.random.Generator, width: float, dep
     h = 0.74
     b.cushion(look.wood, (-width / 2, 0, h - 0.03), (width / 2, depth, h), radius=0.01, steps=2)
     for y in (0.05, depth - 0.05):
-        b.tube(look.shared.iron, [(-width / 2 + 0.05, y, 0), (-width / 2 + 0.05, y, h / 2), (-width / 2 + 0.05, y, h - 0.03)], 0.018)
+        b.tube(
+            look.shared.iron,
+            [(-width / 2 + 0.05, y, 0), (-width / 2 + 0.05, y, h / 2), (-width / 2 + 0.05, y, h - 0.03)],
+            0.018,
+        )
     x0, x1 = width / 2 - 0.42, width / 2 - 0.02
     b.box(look.paint, (x0, 0.03, 0.06), (x1, depth - 0.05, h - 0.03))
     for k in range(3):
         z = 0.08 + 0.21 * k
         front(b, look.paint, look.shared.metal, (x0, z), (x1, z + 0.21), depth - 0.05)
     with b.placed(-0.08 * width, 0.2, h):
-        monitor(b, look, 0.56, 0.34, 0.11)
+        monitor(b, look, look.shared.screen, 0.56, 0.34, 0.11)
     b.box(look.shared.black, (-0.08 * width - 0.21, depth - 0.24, h), (-0.08 * width + 0.21, depth - 0.1, h + 0.016))
     for row in range(4):
         for col in range(12 if b.detail > 0.5 else 0):
@@ -256,22 +225,35 @@ def desk(b: MeshBuilder, look: Look, rng: np.random.Generator, width: float, dep
         decor.mug(b, look, rng)
     x, y = -width / 2 + 0.14, 0.14
     b.revolve_at(look.shared.iron, (x, y, h), [(0, 0), (0.075, 0), (0.075, 0.015), (0, 0.02)])
-    arm = [(x, y, h), (x + 0.02, y, h + 0.2), (x - 0.02, y + 0.02, h + 0.36), (x + 0.08, y + 0.12, h + 0.46), (x + 0.16, y + 0.2, h + 0.44)]
+    arm = [
+        (x, y, h),
+        (x + 0.02, y, h + 0.2),
+        (x - 0.02, y + 0.02, h + 0.36),
+        (x + 0.08, y + 0.12, h + 0.46),
+        (x + 0.16, y + 0.2, h + 0.44),
+    ]
     b.tube(look.shared.iron, arm, 0.008)
-    b.revolve_at(look.paint, (x + 0.16, y + 0.2, h + 0.36), [(0.085, 0), (0.05, 0.07), (0.02, 0.1), (0.016, 0.096), (0.046, 0.066), (0.081, 0)])
+    b.revolve_at(
+        look.paint,
+        (x + 0.16, y + 0.2, h + 0.36),
+        [(0.085, 0), (0.05, 0.07), (0.02, 0.1), (0.016, 0.096), (0.046, 0.066), (0.081, 0)],
+    )
     with b.placed(-0.33 * width, depth - 0.2, h, yaw=float(rng.normal(0, 0.3))):
-        b.quad(look.shared.labels, [(-0.1, -0.14, 0.002), (0.1, -0.14, 0.002), (0.1, 0.14, 0.002), (-0.1, 0.14, 0.002)],
-               decor.cell_uv(decor.LABELS, int(rng.integers(16))))
+        b.quad(
+            look.shared.labels,
+            [(-0.1, -0.14, 0.002), (0.1, -0.14, 0.002), (0.1, 0.14, 0.002), (-0.1, 0.14, 0.002)],
+            decor.cell_uv(decor.LABELS, int(rng.integers(16))),
+        )
 
 
-def monitor(b: MeshBuilder, look: Look, width: float, height: float, lift: float) -> None:
+def monitor(b: MeshBuilder, look: Look, image: Material, width: float, height: float, lift: float) -> None:
     """Screen that faces +y on a stand; its foot at the origin."""
     b.cushion(look.shared.black, (-0.12, -0.09, 0), (0.12, 0.09, 0.015), radius=0.006, steps=2)
     b.box(look.shared.black, (-0.02, -0.03, 0.01), (0.02, -0.01, lift + 0.5 * height))
     x, z0, z1 = width / 2, lift, lift + height
     b.box(look.shared.black, (-x, -0.012, z0), (x, 0.018, z1))
     x, z0, z1, y = x - 0.012, z0 + 0.014, z1 - 0.012, 0.019
-    b.quad(look.shared.screen, [(x, y, z0), (-x, y, z0), (-x, y, z1), (x, y, z1)], [(0, 0), (1, 0), (1, 1), (0, 1)])
+    b.quad(image, [(x, y, z0), (-x, y, z0), (-x, y, z1), (x, y, z1)], [(0, 0), (1, 0), (1, 1), (0, 1)])
 
 
 def office_chair(b: MeshBuilder, look: Look) -> None:
@@ -295,7 +277,7 @@ def tv_unit(b: MeshBuilder, look: Look, rng: np.random.Generator, width: float, 
     h = 0.46
     drawers(b, look, look.wood, width, depth, h, rows=1, cols=3)
     with b.placed(0, 0.16, h):
-        monitor(b, look, min(1.15, 0.8 * width), 0.64, 0.06)
+        monitor(b, look, look.shared.view, min(1.15, 0.8 * width), 0.64, 0.06)
     for s in (-1, 1):
         with b.placed(s * (width / 2 - 0.12), depth / 2, h):
             decor.ornament(b, look, rng, 0.26)

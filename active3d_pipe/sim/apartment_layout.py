@@ -82,7 +82,7 @@ def _shared(a: tuple, b: tuple) -> tuple[int, float, float] | None:
     tiny = 1e-9
     for side, (i, j) in enumerate(((1, 3), (2, 0), (3, 1), (0, 2))):
         if abs(a[i] - b[j]) < tiny:
-            k = (side % 2)  # sides 0 and 2 run along x, 1 and 3 along y
+            k = side % 2  # sides 0 and 2 run along x, 1 and 3 along y
             low, high = max(a[k], b[k]), min(a[k + 2], b[k + 2])
             if high - low > 1e-6:
                 return side, low, high

@@ -13,6 +13,7 @@ import numpy as np
 
 Painter = Callable[[np.random.Generator, int], np.ndarray]
 Vector = Sequence[float] | np.ndarray
+Points = Sequence[Sequence[float]] | Sequence[np.ndarray] | np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +45,14 @@ class Part:
 _CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=np.float64)
 _QUAD = np.array([[0, 1, 2], [0, 2, 3]])
 # The six faces of a box: axis of the normal, its sign, the two axes that span it.
-_BOX_FACES = {"-x": (0, 0, 1, 2), "+x": (0, 1, 1, 2), "-y": (1, 0, 0, 2), "+y": (1, 1, 0, 2), "-z": (2, 0, 0, 1), "+z": (2, 1, 0, 1)}
+_BOX_FACES = {
+    "-x": (0, 0, 1, 2),
+    "+x": (0, 1, 1, 2),
+    "-y": (1, 0, 0, 2),
+    "+y": (1, 1, 0, 2),
+    "-z": (2, 0, 0, 1),
+    "+z": (2, 1, 0, 1),
+}
 
 
 class MeshBuilder:
@@ -70,7 +78,9 @@ class MeshBuilder:
         cz, sz, cx, sx = math.cos(yaw), math.sin(yaw), math.cos(tilt), math.sin(tilt)
         cy, sy = math.cos(roll), math.sin(roll)
         turn = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-        turn = turn @ np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]) @ np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+        turn = (
+            turn @ np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]) @ np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+        )
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = turn, (x, y, z)
         self._transform = before @ T
@@ -80,7 +90,9 @@ class MeshBuilder:
         finally:
             self._transform, self._shift = before, shift
 
-    def add(self, material: Material, vertices: np.ndarray, faces: np.ndarray, uv_m: np.ndarray, *, fit: bool = False) -> None:
+    def add(
+        self, material: Material, vertices: np.ndarray, faces: np.ndarray, uv_m: np.ndarray, *, fit: bool = False
+    ) -> None:
         """Append triangles: vertices (V, 3) local m, faces (F, 3), uv (V, 2) in m, or in 0..1 when `fit`."""
         part = self.parts.setdefault(material.name, Part(material))
         part.vertices.append(vertices @ self._transform[:3, :3].T + self._transform[:3, 3])
@@ -88,20 +100,22 @@ class MeshBuilder:
         part.uv.append(uv_m if fit else uv_m / material.metres + self._shift)
         part.count += len(vertices)
 
-    def quad(self, material: Material, corners: np.ndarray, uv: np.ndarray | None = None) -> None:
+    def quad(self, material: Material, corners: Points, uv: Points | None = None) -> None:
         """A rectangle from four corners, counter-clockwise from lower left; `uv` (4, 2) in 0..1 or None for metres."""
-        corners = np.asarray(corners, dtype=np.float64)
+        points = np.asarray(corners, dtype=np.float64)
         if uv is None:
-            size = np.linalg.norm(corners[[1, 3]] - corners[0], axis=1)
-            self.add(material, corners, _QUAD, _CORNERS * size)
+            size = np.linalg.norm(points[[1, 3]] - points[0], axis=1)
+            self.add(material, points, _QUAD, _CORNERS * size)
         else:
-            self.add(material, corners, _QUAD, np.asarray(uv, dtype=np.float64), fit=True)
+            self.add(material, points, _QUAD, np.asarray(uv, dtype=np.float64), fit=True)
 
     def box(self, material: Material, low: Vector, high: Vector, *, skip: Sequence[str] = ()) -> None:
         """An axis-aligned box without the faces named in `skip` ("-x", "+z", ...); box mapping in metres."""
         ends = np.array([low, high], dtype=np.float64)
         size = ends[1] - ends[0]
-        vertices, uvs, faces = [], [], []
+        vertices: list[np.ndarray] = []
+        uvs: list[np.ndarray] = []
+        faces: list[np.ndarray] = []
         for name, (axis, side, a, b) in _BOX_FACES.items():
             if name in skip:
                 continue
@@ -139,8 +153,9 @@ class MeshBuilder:
         p = np.asarray(profile, dtype=np.float64)
         angle = np.linspace(0, 2 * math.pi, n + 1)
         ring = np.stack([np.cos(angle), aspect * np.sin(angle)], -1)
-        points = np.concatenate([
-            p[None, :, :1] * ring[:, None, :], np.broadcast_to(p[None, :, 1:], (n + 1, len(p), 1))], axis=-1)
+        points = np.concatenate(
+            [p[None, :, :1] * ring[:, None, :], np.broadcast_to(p[None, :, 1:], (n + 1, len(p), 1))], axis=-1
+        )
         self.grid(material, points)
 
     def revolve_at(self, material: Material, position: Vector, profile: Sequence[tuple[float, float]]) -> None:
@@ -148,7 +163,7 @@ class MeshBuilder:
         with self.placed(*(float(x) for x in position)):
             self.revolve(material, profile)
 
-    def tube(self, material: Material, path: Sequence[Vector], radius: float, *, segments: int = 8) -> None:
+    def tube(self, material: Material, path: Points | Sequence[Vector], radius: float, *, segments: int = 8) -> None:
         """A round rod along a polyline (K, 3), capped by closing the end rings."""
         n = self.segments(segments, 5)
         p = np.asarray(path, dtype=np.float64)

@@ -77,7 +77,12 @@ class Floor:
 
     def clearance(self, blocked: np.ndarray | None = None) -> np.ndarray:
         """Distance of every cell to furniture or walls, m."""
-        return ndimage.distance_transform_edt(~np.pad(self.blocked if blocked is None else blocked, 1, constant_values=True))[1:-1, 1:-1] * CELL
+        return (
+            ndimage.distance_transform_edt(
+                ~np.pad(self.blocked if blocked is None else blocked, 1, constant_values=True)
+            )[1:-1, 1:-1]
+            * CELL
+        )
 
     def region(self, blocked: np.ndarray) -> np.ndarray | None:
         """Cells from which an agent gets to every door and to a roomy place; None if there are none."""
@@ -105,15 +110,23 @@ class Floor:
         return True
 
     def wall(
-        self, width: float, depth: float, height: float, *, prefer: str = "any", near: Spot | None = None, gap: float = 0.02
+        self,
+        width: float,
+        depth: float,
+        height: float,
+        *,
+        prefer: str = "any",
+        near: Spot | None = None,
+        gap: float = 0.02,
     ) -> Spot | None:
-        """Claim a place against a wall; prefer "corner", "middle" or "any", or close to `near`. None if there is none."""
+        """Claim a place against a wall; prefer "corner", "middle" or "any", or near a spot. None if full."""
         candidates = []
         for side in range(4):
             length = self.room.side(side)[3]
             if length < width + 0.04:
                 continue
-            for along in np.arange(width / 2 + 0.03, length - width / 2 - 0.02, 0.1).tolist() + [length - width / 2 - 0.03]:
+            places = np.arange(width / 2 + 0.03, length - width / 2 - 0.02, 0.1)
+            for along in [*places.tolist(), length - width / 2 - 0.03]:
                 off = gap
                 clash = False
                 for a, c, bottom, _ in self.used[side]:
@@ -127,14 +140,18 @@ class Floor:
                 spot = self.on_wall(side, along, off)
                 if near is not None:
                     cost += 2 * math.hypot(spot[0] - near[0], spot[1] - near[1])
-                candidates.append((cost + float(self.rng.uniform(0, 0.8)) + (0.3 if off > gap else 0), side, along, spot))
+                candidates.append(
+                    (cost + float(self.rng.uniform(0, 0.8)) + (0.3 if off > gap else 0), side, along, spot)
+                )
         for _, side, along, spot in sorted(candidates)[:40]:
             if self.take(spot, width, depth):
                 self.used[side].append((along - width / 2, along + width / 2, 0.0, height))
                 return spot
         return None
 
-    def free(self, width: float, depth: float, *, yaws: tuple[float, ...], clear: float = 0.0, tries: int = 60) -> Spot | None:
+    def free(
+        self, width: float, depth: float, *, yaws: tuple[float, ...], clear: float = 0.0, tries: int = 60
+    ) -> Spot | None:
         """Claim a place away from the walls, roomiest first; `clear` m around it stay free."""
         x0, y0, x1, y1 = self.room.inner
         candidates = []
@@ -163,8 +180,10 @@ class Floor:
         for side in range(4):
             length = self.room.side(side)[3]
             for along in np.arange(width / 2 + 0.12, length - width / 2 - 0.1, 0.15):
-                if all(along + width / 2 + 0.06 <= a or along - width / 2 - 0.06 >= c or z1 <= bottom - 0.06 or z0 >= top
-                       for a, c, z0, z1 in self.used[side]):
+                if all(
+                    along + width / 2 + 0.06 <= a or along - width / 2 - 0.06 >= c or z1 <= bottom - 0.06 or z0 >= top
+                    for a, c, z0, z1 in self.used[side]
+                ):
                     spans.append((float(self.rng.random()), side, float(along)))
         if not spans:
             return None

@@ -16,7 +16,9 @@ WINDOW_DEPTH = OUTER + HALF_WALL - 0.02  # m, from the inner face of an outside 
 SLAB = 0.15  # m, thickness of floor and roof slabs
 
 
-def build_room_shell(b: MeshBuilder, index: int, room: Room, look: Look, accent_side: int, rng: np.random.Generator) -> None:
+def build_room_shell(
+    b: MeshBuilder, index: int, room: Room, look: Look, accent_side: int, rng: np.random.Generator
+) -> None:
     """Floor, ceiling, four walls with their openings, skirting and cornice of one room."""
     x0, y0, x1, y1 = room.inner
     b.quad(look.floor, [(x0, y0, 0), (x1, y0, 0), (x1, y1, 0), (x0, y1, 0)])
@@ -64,7 +66,9 @@ def _strips(b: MeshBuilder, look: Look, length: float, openings: list[Opening]) 
         if x1 > x0:
             b.box(look.shared.trim, (x0, 0, 0), (x1, 0.016, 0.085), skip=("-y",))
             b.box(look.shared.trim, (x0, 0, 0.085), (x1, 0.009, 0.1), skip=("-y",))
-    steps = np.array([(0.0, HEIGHT - 0.075), (0.012, HEIGHT - 0.07), (0.02, HEIGHT - 0.05), (0.05, HEIGHT - 0.02), (0.055, HEIGHT)])
+    steps = np.array(
+        [(0.0, HEIGHT - 0.075), (0.012, HEIGHT - 0.07), (0.02, HEIGHT - 0.05), (0.05, HEIGHT - 0.02), (0.055, HEIGHT)]
+    )
     points = np.stack([np.stack([np.full(len(steps), x), steps[:, 0], steps[:, 1]], -1) for x in (0.0, length)])
     b.grid(look.shared.ceiling, points)
 
@@ -105,11 +109,24 @@ def _door_leaf(b: MeshBuilder, shared: Shared, o: Opening, rng: np.random.Genera
             for s in (-1, 1):
                 low, high = sorted((s * t / 2, s * (t / 2 + 0.008)))
                 b.box(shared.door, (0.12, low, z0), (w - 0.12, high, z1))
-                b.box(shared.door, (0.17, low - (0.006 if s < 0 else 0), z0 + 0.05), (w - 0.17, high + (0.006 if s > 0 else 0), z1 - 0.05))
+                b.box(
+                    shared.door,
+                    (0.17, low - (0.006 if s < 0 else 0), z0 + 0.05),
+                    (w - 0.17, high + (0.006 if s > 0 else 0), z1 - 0.05),
+                )
         for s in (-1, 1):
             y = s * t / 2
-            b.tube(shared.metal, [(w - 0.06, y, 1.02), (w - 0.06, y + s * 0.05, 1.02), (w - 0.1, y + s * 0.055, 1.02),
-                                  (w - 0.18, y + s * 0.05, 1.02)], 0.009, segments=6)
+            b.tube(
+                shared.metal,
+                [
+                    (w - 0.06, y, 1.02),
+                    (w - 0.06, y + s * 0.05, 1.02),
+                    (w - 0.1, y + s * 0.055, 1.02),
+                    (w - 0.18, y + s * 0.05, 1.02),
+                ],
+                0.009,
+                segments=6,
+            )
 
 
 def _window(b: MeshBuilder, look: Look, o: Opening, rng: np.random.Generator, *, bath: bool) -> None:
@@ -131,7 +148,12 @@ def _window(b: MeshBuilder, look: Look, o: Opening, rng: np.random.Generator, *,
     sashes = max(1, round(width / 0.75))
     for k in range(sashes):
         a, c = x0 + k * width / sashes, x0 + (k + 1) * width / sashes
-        for low, high in (((a, z0), (c, z0 + f)), ((a, z1 - f), (c, z1)), ((a, z0 + f), (a + f, z1 - f)), ((c - f, z0 + f), (c, z1 - f))):
+        for low, high in (
+            ((a, z0), (c, z0 + f)),
+            ((a, z1 - f), (c, z1)),
+            ((a, z0 + f), (a + f, z1 - f)),
+            ((c - f, z0 + f), (c, z1 - f)),
+        ):
             b.box(trim, (low[0], y0, low[1]), (high[0], y1, high[1]))
         bars = max(1, round(height / 0.6))
         for j in range(1, bars):
