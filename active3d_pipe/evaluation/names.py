@@ -55,6 +55,7 @@ SINGLE: dict[str, tuple[str, str, str]] = {
     "truth_area_m2": ("m²", "", "area of the ground truth"),
     "observable_share": ("%", "", "share of the ground truth that a reachable pose can see"),
     "path_m": ("m", "lower", "length of the walked path"),
+    "min_clearance_m": ("m", "higher", "least distance of a walked pose to any true surface"),
     "collisions": ("", "lower", "steps that ended in or passed through true surface"),
     "steps": ("", "", "exploration steps"),
     "rounds": ("", "", "rounds of the loop"),

@@ -122,7 +122,7 @@ def _paint_curves(axes: Axes, panel: str, series: Sequence[Curve]) -> None:
         y = np.array([np.nan if v is None else v for v in curve.values], dtype=np.float64) * (100 if percent else 1)
         few = MARKERS[i % len(MARKERS)] if len(y) <= 40 else None
         axes.plot(curve.steps, y, color=SERIES[i % len(SERIES)], marker=few, markersize=3.5, label=curve.label)
-    unit = f" [{series[0].unit}]" if series[0].unit else ""
+    unit = "" if series[0].unit in ("", "1") else f" [{series[0].unit}]"
     axes.set_title(panel + unit)
     axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.margins(y=0.12)

@@ -37,7 +37,7 @@ LAYOUTS: tuple[Layout, ...] = (
     ),
 )
 STATISTICS = ("_median", "_p10")  # of the psnr rows: their suffix comes after the view set's
-DECIMALS = {"cm": 2, "dB": 2, "m": 1, "m²": 1, "s": 2, "MB": 0}
+DECIMALS = {"cm": 2, "dB": 2, "m": 2, "m²": 1, "s": 2, "MB": 0}
 COUNTS = ("num_views", "steps", "rounds", "collisions", "keyframes", "gaussians")
 
 

@@ -116,6 +116,7 @@ def test_every_metric_is_explained_and_json_able():
     m = ev.evaluate_geometry(square(1.0, 0.01), truth, SETTINGS, seen_by=camera, query_sdf=lambda p: p[:, 2])
     sets = {"heldout": [frame(51, 2.0)], "train": [frame(77, 2.0)], "circle": [frame(77, 2.0)]}
     m |= ev.view_metrics(ev.evaluate_views(constant_render(0.3, 2.0), sets, SETTINGS)[0])
+    m |= {"steps": 10, "rounds": 2, "collisions": 0, "path_m": 1.5, "min_clearance_m": 0.4}
     unexplained = [name for name in m if describe(name) is None]
     assert unexplained == []
     rows = ev.summary_rows(m)

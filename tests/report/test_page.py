@@ -112,7 +112,7 @@ def test_without_data_every_section_says_why():
 
 def test_numbers_reach_the_tables_with_units(full):
     text = " ".join("".join(parse(full).text).split())
-    for expected in ("0.62 cm", "96.2 %", "25.31 dB", "15.4 m", "97.2 %", "1 200", "predicted, implicit [bit]"):
+    for expected in ("0.62 cm", "96.2 %", "25.31 dB", "15.40 m", "97.2 %", "1 200", "predicted, implicit [bit]"):
         assert expected.replace(" 200", "\u202f200") in text or expected in text
     assert "lpips, lpips_circle, lpips_train: no weights on this machine" in text
     # Only what was measured has a column: no fixed-density form in this run.
