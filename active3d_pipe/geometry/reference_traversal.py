@@ -1,6 +1,7 @@
 """Slow, obvious twins of `kernels_traversal.py`, float64; what the tests compare the kernels against."""
 
 import math
+from itertools import pairwise
 
 import numpy as np
 
@@ -22,7 +23,7 @@ def traverse(
                     cuts.append(t)
     cuts.sort()
     voxels: list[tuple[int, int, int]] = []
-    for a, b in zip(cuts[:-1], cuts[1:], strict=True):
+    for a, b in pairwise(cuts):
         middle = np.asarray(origin) + 0.5 * (a + b) * np.asarray(direction)
         i, j, k = (math.floor(c) for c in middle)
         inside = 0 <= i < opaque.shape[0] and 0 <= j < opaque.shape[1] and 0 <= k < opaque.shape[2]
@@ -54,7 +55,7 @@ def carve(
             continue
         end = None
         if length <= longest:
-            end = tuple(int(math.floor(c)) for c in np.asarray(origin) + length * np.asarray(direction))
+            end = tuple(math.floor(c) for c in np.asarray(origin) + length * np.asarray(direction))
             if all(0 <= c < n for c, n in zip(end, shape, strict=True)):
                 hit[end] += 1
         for v in traverse(clear, origin, direction, min(length, longest)):

@@ -11,7 +11,7 @@ class InformationSettings(Settings):
     alpha: float = Field(0.5, ge=0, description="weight of the uncertainty U(v) (eq. nbv_weight)")
     beta: float = Field(0.5, ge=0, description="weight of the hybrid entropy H(v) in bits (eq. nbv_weight)")
     surface_weight: float = Field(
-        0.5, ge=0, description="weight of improving a surface seen poorly, against discovering a voxel"
+        0.3, ge=0, description="weight of improving a surface seen poorly, against discovering a voxel"
     )
     residual_bits: float = Field(
         0.1, ge=0, le=1, description="entropy that a voxel keeps, per branch, after it has been seen, bits"

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from active3d_pipe.information.gain import GainTerms
-from active3d_pipe.planning.candidates import Directions, coarse_positions, fine_positions
+from active3d_pipe.planning.candidates import Directions, coarse_positions, fine_positions, view_directions
 from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.free_space import FreeSpace
 from active3d_pipe.planning.reward import RewardField, exact_terms, sphere_rewards
@@ -72,13 +72,13 @@ def score(
     field: RewardField,
     T_world_camera: np.ndarray,
     camera: Camera,
-    directions: Directions,
     motion: MotionSettings,
     settings: PlanningSettings,
     previous: Decision | None,
 ) -> Pool:
     """Score every view of the reachable space, coarse to fine, and the best ones exactly."""
     R = T_world_camera[:3, :3]
+    directions = view_directions(camera, settings.num_yaws, settings.pitches_deg)
     num_views = len(directions.rotations)
 
     def utilities(voxels: np.ndarray, rewards: np.ndarray) -> np.ndarray:

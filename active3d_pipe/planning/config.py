@@ -10,7 +10,7 @@ class PlanningSettings(Settings):
     """Section `planning` of the configuration."""
 
     information: InformationSettings = Field(
-        default_factory=InformationSettings, description="weights and observation model of the expected gain"
+        InformationSettings(), description="weights and observation model of the expected gain"
     )
     # Candidates.
     coarse_spacing_m: float = Field(0.5, gt=0, description="spacing of candidate positions over all free space, m")
@@ -24,13 +24,13 @@ class PlanningSettings(Settings):
     unknown_free_path_m: float = Field(
         1.0, gt=0, description="mean length of a ray through unknown space before something stops it, m"
     )
-    credit_views: int = Field(48, ge=0, description="walked poses used to find voxels that stay unseen though looked at")
+    credit_views: int = Field(48, ge=0, description="walked poses searched for looks that brought nothing")
     credit_factor: float = Field(
         0.5, gt=0, le=1, description="what each look that brought nothing leaves of a voxel's expected gain"
     )
     # Choice.
     view_steps: float = Field(
-        6.0, gt=0, description="fixed cost of a view in steps, added to travel: larger prefers large gains far away"
+        10.0, gt=0, description="fixed cost of a view in steps, added to travel: larger prefers large gains far away"
     )
     commitment: float = Field(
         1.25, ge=1, description="factor on the utility of going on to the goal of the decision before"

@@ -4,13 +4,14 @@
 uncertainty volume and the poses walked so far, never the scene.
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from active3d_pipe.errors import InputError
 from active3d_pipe.geometry.voxel_traversal import visible_voxels
-from active3d_pipe.planning.candidates import view_directions
+from active3d_pipe.planning.candidates import Directions, view_directions
 from active3d_pipe.planning.choice import Pool, looks_along, reward_density, score, view_cost_steps
 from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.free_space import FreeSpace, build_free_space
@@ -22,6 +23,25 @@ from active3d_pipe.structures.decision import Decision, Reason
 from active3d_pipe.structures.frame import check_pose
 from active3d_pipe.structures.motion import MotionSettings
 from active3d_pipe.structures.uncertainty_volume import UncertaintyVolume
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Task:
+    """What stays the same while one decision is taken."""
+
+    round: int
+    T: np.ndarray
+    camera: Camera
+    directions: Directions
+    motion: MotionSettings
+    settings: PlanningSettings
+    rng: np.random.Generator
+
+    @property
+    def round_length_m(self) -> float:
+        """How far one round can walk."""
+        return self.settings.max_steps_per_round * self.motion.max_step_m
+
 
 # Views that are appended to a short path at most.
 LONGEST_CHAIN = 4
@@ -65,21 +85,21 @@ def decide(
     walked = np.concatenate([np.asarray(walked_poses, dtype=np.float64).reshape(-1, 4, 4), T[None]])
     field = build_reward_field(volume, walked, camera, settings)
     directions = view_directions(camera, settings.num_yaws, settings.pitches_deg)
+    task = _Task(volume.round, T, camera, directions, motion, settings, rng)
     best = 0.0
     for relaxed in (False, True):
         space = build_free_space(volume, T, walked[:, :3, 3], motion, settings, relaxed=relaxed)
-        pool = score(space, field, T, camera, directions, motion, settings, previous)
+        pool = score(space, field, T, camera, motion, settings, previous)
         best = max((t.reward for t in pool.terms), default=0.0)
         if best >= settings.stop_reward:
-            reason = Reason.RELAXED if relaxed else Reason.BEST_GAIN
-            decision = _go(volume.round, space, pool, field, T, camera, motion, settings, rng, reason)
+            decision = _go(task, space, pool, field, Reason.RELAXED if relaxed else Reason.BEST_GAIN)
             if decision is not None:
                 return decision
     terms = {**_space_terms(space), "best_reward": best, "stop_reward": settings.stop_reward}
     if _movable(space):
-        return Decision(volume.round, Reason.STOP_GAIN, True, np.zeros((0, 4, 4)), pool.ranking(settings.num_ranked, {}),
-                        -1, terms)
-    return _unstick(volume.round, space, T, walked, motion, settings, previous, terms)
+        ranking = pool.ranking(settings.num_ranked, {})
+        return Decision(volume.round, Reason.STOP_GAIN, True, np.zeros((0, 4, 4)), ranking, -1, terms)
+    return _unstick(task, space, walked, previous, terms)
 
 
 def bootstrap_decision(T_start: np.ndarray, motion: MotionSettings, settings: PlanningSettings) -> Decision:
@@ -93,26 +113,16 @@ def bootstrap_decision(T_start: np.ndarray, motion: MotionSettings, settings: Pl
     return Decision(-1, Reason.START, False, path, terms={"path_steps": len(path), "path_length_m": 0.0})
 
 
-def _go(
-    round: int,
-    space: FreeSpace,
-    pool: Pool,
-    field: RewardField,
-    T: np.ndarray,
-    camera: Camera,
-    motion: MotionSettings,
-    settings: PlanningSettings,
-    rng: np.random.Generator,
-    reason: Reason,
-) -> Decision | None:
+def _go(task: _Task, space: FreeSpace, pool: Pool, field: RewardField, reason: Reason) -> Decision | None:
     """Walk to the best candidate that can be walked to; None when there is none."""
+    settings, T = task.settings, task.T
     density = reward_density(pool, space)
     tried: dict[int, bool] = {}
     for index in range(len(pool.terms)):
         if pool.terms[index].reward < settings.stop_reward:
             continue
-        path = plan_path(space, T[:3, 3], pool.voxels[index], density, settings, rng)
-        poses = _poses(path, T, pool.poses[index], field, camera, motion, settings, None)
+        path = plan_path(space, T[:3, 3], pool.voxels[index], density, settings, task.rng)
+        poses = _poses(task, path, T, pool.poses[index], field, None)
         tried[index] = len(poses) > 0
         if len(poses):
             break
@@ -123,7 +133,7 @@ def _go(
     goal_ahead = len(poses) > settings.max_steps_per_round
     chained = 0
     if len(poses) < settings.min_steps_per_round:
-        poses, chained = _chain(poses, index, space, pool, field, camera, motion, settings, rng, density)
+        poses, chained = _chain(task, poses, index, space, pool, field, density)
     chosen = pool.terms[index]
     ranking = pool.ranking(max(settings.num_ranked, index + 1), tried)
     terms: dict[str, Any] = {
@@ -153,64 +163,53 @@ def _go(
     }
     if reason is Reason.BEST_GAIN and len(tried) > 1:
         reason = Reason.FALLBACK
-    return Decision(round, reason, False, poses[: settings.max_steps_per_round], ranking, index, terms)
+    return Decision(task.round, reason, False, poses[: settings.max_steps_per_round], ranking, index, terms)
 
 
 def _poses(
-    path: PlannedPath,
-    T: np.ndarray,
-    T_goal: np.ndarray,
-    field: RewardField,
-    camera: Camera,
-    motion: MotionSettings,
-    settings: PlanningSettings,
-    max_steps: int | None,
+    task: _Task, path: PlannedPath, T: np.ndarray, T_goal: np.ndarray, field: RewardField, max_steps: int | None
 ) -> np.ndarray:
-    """Step poses along a path, looking where the reward lies on the way."""
-    directions = view_directions(camera, settings.num_yaws, settings.pitches_deg)
-    looks = looks_along(path.points, T[:3, :3], T_goal, field, directions, motion, settings.coarse_spacing_m)
-    return step_path(T, path.points, looks, motion, max_steps)
+    """Step poses along a path from pose T, looking where the reward lies on the way."""
+    spacing = task.settings.coarse_spacing_m
+    looks = looks_along(path.points, T[:3, :3], T_goal, field, task.directions, task.motion, spacing)
+    return step_path(T, path.points, looks, task.motion, max_steps)
 
 
 def _chain(
+    task: _Task,
     poses: np.ndarray,
     index: int,
     space: FreeSpace,
     pool: Pool,
     field: RewardField,
-    camera: Camera,
-    motion: MotionSettings,
-    settings: PlanningSettings,
-    rng: np.random.Generator,
     density: np.ndarray,
 ) -> tuple[np.ndarray, int]:
     """Continue a short path to the views that are best after the ones before it; (poses, number of views added).
 
     A round costs mapping and planning, however short its path. What the views so far will have seen counts no more.
     """
+    settings, grid = task.settings, field.grid
     open_views = [i for i in range(len(pool.terms)) if i != index]
     added = 0
-    opaque = field.opaque.reshape(field.grid.shape)
+    opaque = field.opaque.reshape(grid.shape)
     while len(poses) < settings.min_steps_per_round and open_views and added < LONGEST_CHAIN:
-        seen = visible_voxels(opaque, field.grid, pool.poses[index], camera, max_range_m=field.max_range_m)
+        T = poses[-1]
+        seen = visible_voxels(opaque, grid, T, task.camera, max_range_m=field.max_range_m)
         field = field.without(seen)
-        here = space.moved_to(pool.voxels[index], settings, settings.max_steps_per_round * motion.max_step_m)
+        here = space.moved_to(pool.voxels[index], settings, task.round_length_m)
         travel = here.cost[tuple(pool.voxels[open_views].T)]
-        near = [i for i, c in zip(open_views, travel, strict=True) if c < settings.max_steps_per_round * motion.max_step_m]
+        near = [i for i, c in zip(open_views, travel, strict=True) if c < task.round_length_m]
         if not near:
             break
-        terms = exact_terms(field, pool.poses[near], camera)
-        cost = view_cost_steps(
-            here.cost[tuple(pool.voxels[near].T)], pool.poses[index][:3, :3], pool.poses[near][:, :3, :3], motion
-        )
-        utility = np.array([t.reward for t in terms]) / (cost + settings.view_steps)
-        best = int(utility.argmax())
+        terms = exact_terms(field, pool.poses[near], task.camera)
+        rotations = pool.poses[near][:, :3, :3]
+        cost = view_cost_steps(here.cost[tuple(pool.voxels[near].T)], T[:3, :3], rotations, task.motion)
+        best = int((np.array([t.reward for t in terms]) / (cost + settings.view_steps)).argmax())
         if terms[best].reward < settings.stop_reward:
             break
         index = near[best]
-        T = poses[-1]
-        path = plan_path(here, T[:3, 3], pool.voxels[index], density, settings, rng)
-        more = _poses(path, T, pool.poses[index], field, camera, motion, settings, settings.max_steps_per_round)
+        path = plan_path(here, T[:3, 3], pool.voxels[index], density, settings, task.rng)
+        more = _poses(task, path, T, pool.poses[index], field, settings.max_steps_per_round)
         poses = np.concatenate([poses, more])
         open_views.remove(index)
         added += 1
@@ -231,26 +230,19 @@ def _space_terms(space: FreeSpace) -> dict[str, Any]:
 
 
 def _unstick(
-    round: int,
-    space: FreeSpace,
-    T: np.ndarray,
-    walked: np.ndarray,
-    motion: MotionSettings,
-    settings: PlanningSettings,
-    previous: Decision | None,
-    terms: dict[str, Any],
+    task: _Task, space: FreeSpace, walked: np.ndarray, previous: Decision | None, terms: dict[str, Any]
 ) -> Decision:
     """The agent cannot move: look around once, then go back the way it came, then stop."""
     tried = None if previous is None else previous.reason
     if tried not in (Reason.LOOK_AROUND, Reason.BACKTRACK, Reason.START):
-        path = look_around(T, 360.0, settings.bootstrap_pitch_deg, motion)
-        return Decision(round, Reason.LOOK_AROUND, False, path, terms=terms)
+        path = look_around(task.T, 360.0, task.settings.bootstrap_pitch_deg, task.motion)
+        return Decision(task.round, Reason.LOOK_AROUND, False, path, terms=terms)
     back = _way_back(space, walked)
     if tried is not Reason.BACKTRACK and back is not None:
-        path = step_path(T, back, [], motion, settings.max_steps_per_round)
+        path = step_path(task.T, back, [], task.motion, task.settings.max_steps_per_round)
         if len(path):
-            return Decision(round, Reason.BACKTRACK, False, path, terms=terms)
-    return Decision(round, Reason.STOP_STUCK, True, np.zeros((0, 4, 4)), terms=terms)
+            return Decision(task.round, Reason.BACKTRACK, False, path, terms=terms)
+    return Decision(task.round, Reason.STOP_STUCK, True, np.zeros((0, 4, 4)), terms=terms)
 
 
 def _way_back(space: FreeSpace, walked: np.ndarray) -> np.ndarray | None:

@@ -21,6 +21,8 @@ class FreeSpace:
     Attributes:
         risk: the risk field (owns the grid, the clearance and the joint occupancy).
         free: (X, Y, Z) bool, known to be free.
+        checked_m: (X, Y, Z) float32, the clearance that paths are checked against: that of the risk field, but 0
+            near a tight start where something solid is too close.
         passable: (X, Y, Z) bool, the agent's centre may be in this voxel.
         start: (3,) int64 voxel of the agent.
         required_m: clearance that `passable` demands away from the start.
@@ -32,6 +34,7 @@ class FreeSpace:
 
     risk: RiskField
     free: np.ndarray
+    checked_m: np.ndarray
     passable: np.ndarray
     start: np.ndarray
     required_m: float
@@ -113,6 +116,34 @@ def clearance(free: np.ndarray, voxel_size: float, longest_m: float) -> np.ndarr
     return np.maximum(d, 0)
 
 
+def _open_escape(
+    passable: np.ndarray,
+    clear: np.ndarray,
+    solid: np.ndarray,
+    grid: VoxelGrid,
+    position: np.ndarray,
+    limits_m: tuple[float, float],
+    settings: PlanningSettings,
+) -> np.ndarray:
+    """Let the agent out of a tight spot: near it, unseen space may come as close as it does at the start.
+
+    Only what is *unseen* may: from what is known to be solid the required clearance is kept. Extends `passable` in
+    place and returns the clearance that paths are checked against.
+    """
+    required, escape = limits_m
+    reach = int(settings.escape_m / grid.voxel_size) + 1
+    start = np.clip(grid.index_of(position), 0, np.asarray(grid.shape) - 1)
+    box = tuple(slice(max(0, c - reach), c + reach + 1) for c in start)
+    centres = np.stack(np.meshgrid(*(grid.axis(i)[box[i]] for i in range(3)), indexing="ij"), axis=-1)
+    near = np.linalg.norm(centres - position, axis=-1) <= settings.escape_m
+    away = kernels.distance_transform(solid.view(np.uint8), int(required / grid.voxel_size) + 2, False)[box]
+    safe = (np.sqrt(away) - 0.5) * grid.voxel_size >= required - 1e-6
+    passable[box] |= near & safe & (clear[box] >= escape - 1e-6)
+    checked = clear.copy()
+    checked[box] = np.where(near & ~safe & (clear[box] < required - 1e-6), 0, clear[box])
+    return checked
+
+
 def build_free_space(
     volume: UncertaintyVolume,
     T_world_camera: np.ndarray,
@@ -138,15 +169,11 @@ def build_free_space(
     position = T_world_camera[:3, 3]
     start = np.clip(grid.index_of(position), 0, np.asarray(grid.shape) - 1)
     passable = clear >= required - 1e-6
-    escape = min(required, float(clear[tuple(start)]))
+    escape, checked = min(required, float(clear[tuple(start)])), clear
     if escape < required:
-        low = np.maximum(start - int(settings.escape_m / grid.voxel_size) - 1, 0)
-        high = start + int(settings.escape_m / grid.voxel_size) + 2
-        box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-        ijk = np.stack(np.meshgrid(*(np.arange(grid.shape[i])[box[i]] for i in range(3)), indexing="ij"), -1)
-        near = np.linalg.norm(grid.centre_of(ijk) - position, axis=-1) <= settings.escape_m
-        passable[box] |= near & (clear[box] >= escape - 1e-6) & free[box]
+        solid = (volume["hit_evidence"] > 0) & ~free
+        checked = _open_escape(passable, clear, solid, grid, position, (required, escape), settings)
     passable[tuple(start)] = True
     planar = motion.model == "ground"
     cost, parent = _geodesic(risk, passable, start, planar, settings, UNREACHABLE)
-    return FreeSpace(risk, free, passable, start, required, escape, cost, parent, planar)
+    return FreeSpace(risk, free, checked, passable, start, required, escape, cost, parent, planar)

@@ -109,6 +109,8 @@ def frustum_gain(
                 dz = (R[2, 0] * x + R[2, 1] * y + R[2, 2] * z) / voxel_size
                 n = walk_ray(opaque, ox, oy, oz, dx, dy, dz, max_range, nx, ny, nz, ids)
                 transmittance = ONE
+                # `through` belongs to a length of one voxel; a slanted ray crosses more of them, in shorter pieces.
+                piece = ONE / (voxel_size * (abs(dx) + abs(dy) + abs(dz)))
                 for m in range(n):
                     v = ids[m]
                     if stamp[v] != c:
@@ -135,7 +137,7 @@ def frustum_gain(
                                 out[c, 2] += part * gain_imp[v]
                                 out[c, 3] += part * gain_exp[v]
                     if kind[v] == 1:
-                        transmittance *= through[v]
+                        transmittance *= through[v] ** piece
                         if transmittance < LEAST_TRANSMITTANCE:
                             break
     return out
@@ -169,13 +171,13 @@ def surface_normals(kind, out):
 
 @njit(parallel=True, fastmath=True, cache=True)
 def count_looks(
-    origins, rotations, fan, opaque, kind, through, quality, normal, shape, voxel_size, max_range, enough,
-    quality_range,
+    origins, rotations, fan, stops, kind, quality, normal, shape, voxel_size, max_range, enough, quality_range
 ):
     """How many of the past views looked at each voxel without the result that they promised, (size,) int32.
 
-    A ray promises to settle the first voxel at which its way is no longer certain, when that one is open, and to
-    bring a surface voxel that it meets up to the quality of its distance and angle. Half of that is demanded.
+    `stops` (flat uint8) holds every voxel in which any ray ever ended. An open voxel on the way there should have
+    been settled by the ray: had it returned, it would have passed or ended there. A surface voxel that it meets
+    should have come up to the quality of its distance and angle; half of that is demanded.
     """
     nx, ny, nz = shape
     count, chunks = origins.shape[0], 2
@@ -191,13 +193,13 @@ def count_looks(
                 dx = (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z) / voxel_size
                 dy = (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z) / voxel_size
                 dz = (R[2, 0] * x + R[2, 1] * y + R[2, 2] * z) / voxel_size
-                n = walk_ray(opaque, ox, oy, oz, dx, dy, dz, max_range, nx, ny, nz, ids)
+                n = walk_ray(stops, ox, oy, oz, dx, dy, dz, max_range, nx, ny, nz, ids)
                 for m in range(n):
                     v = ids[m]
                     if kind[v] == 0:
                         continue
                     if stamp[v] != c:
-                        promised = kind[v] == 1
+                        promised = kind[v] == 1 and stops[v] == 0
                         if kind[v] == 2:
                             a = np.float32(v // (ny * nz)) + np.float32(0.5) - ox
                             b = np.float32((v // nz) % ny) + np.float32(0.5) - oy
@@ -210,6 +212,4 @@ def count_looks(
                         if promised:
                             stamp[v] = c
                             looks[chunk, v] += 1
-                    if through[v] < ONE:
-                        break
     return looks[0] + looks[1]

@@ -69,7 +69,7 @@ def build_reward_field(
     skip = kernels_distance.distance_transform((kind != FREE).view(np.uint8), LONGEST_SKIP, True).astype(np.uint8)
     opaque = (kind == SURFACE).view(np.uint8).ravel()
     quality = np.ascontiguousarray(first.quality).ravel()
-    looks = _looks(grid, opaque, kind.ravel(), through, quality, normal.reshape(-1, 3), walked_poses, camera, settings)
+    looks = _looks(volume, kind.ravel(), quality, normal.reshape(-1, 3), walked_poses, camera, settings)
     credit = np.float32(settings.credit_factor) ** looks.astype(np.float32)
     volumes: InformationVolumes = information_volumes(volume.arrays, information, credit.reshape(grid.shape))
     return RewardField(
@@ -103,10 +103,8 @@ def spread_poses(poses: np.ndarray, count: int) -> np.ndarray:
 
 
 def _looks(
-    grid: VoxelGrid,
-    opaque: np.ndarray,
+    volume: UncertaintyVolume,
     kind: np.ndarray,
-    through: np.ndarray,
     quality: np.ndarray,
     normal: np.ndarray,
     poses: np.ndarray,
@@ -114,15 +112,17 @@ def _looks(
     settings: PlanningSettings,
 ) -> np.ndarray:
     """How many past views promised something of each voxel that did not come true, (size,)."""
+    grid = volume.grid
     if len(poses) == 0 or settings.credit_views == 0:
         return np.zeros(grid.size, np.int32)
     reach = min(settings.max_range_m, camera.far)
     # Coarser rays than for scoring: a voxel that only a corner of the fan touches was not really looked at.
     fan = ray_fan(camera, 2 * fan_stride(camera, grid.voxel_size, reach))[2].astype(np.float32)
+    stops = ((kind == SURFACE) | (volume["hit_evidence"].ravel() > 0)).view(np.uint8)
     chosen = poses[spread_poses(poses, settings.credit_views)]
     return kernels.count_looks(
         np.ascontiguousarray((chosen[:, :3, 3] - grid.origin) / grid.voxel_size, dtype=np.float32),
-        np.ascontiguousarray(chosen[:, :3, :3], dtype=np.float32), fan, opaque, kind, through, quality, normal,
+        np.ascontiguousarray(chosen[:, :3, :3], dtype=np.float32), fan, stops, kind, quality, normal,
         grid.shape, np.float32(grid.voxel_size), np.float32(reach),
         np.float32(settings.information.enough_quality), np.float32(settings.information.quality_range_m),
     )
@@ -141,7 +141,9 @@ def sphere_rewards(field: RewardField, positions_world: np.ndarray, directions: 
     return rays @ directions.members.T
 
 
-def exact_terms(field: RewardField, poses: np.ndarray, camera: Camera, ray_stride: int | None = None) -> list[GainTerms]:
+def exact_terms(
+    field: RewardField, poses: np.ndarray, camera: Camera, ray_stride: int | None = None
+) -> list[GainTerms]:
     """`GainTerms` of every pose (C, 4, 4) over its unique visible voxels, unknown ones by their visibility."""
     if len(poses) == 0:
         return []

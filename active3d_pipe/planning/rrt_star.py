@@ -11,6 +11,7 @@ it, and samples that cannot lie on a better path are dropped (Gammell et al., "I
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -68,7 +69,7 @@ def plan_path(
     seed = np.concatenate([start[None], voxels[1:]]) if len(voxels) > 1 else np.stack([start, voxels[0]])
     rate = cost_rate(space, reward, settings)
     check = (
-        rate, space.risk.clearance_m, np.float32(space.required_m), np.float32(space.escape_m), start,
+        rate, space.checked_m, np.float32(space.required_m), np.float32(space.escape_m), start,
         np.float32(settings.escape_m / grid.voxel_size), np.float32(SAMPLE_SPACING),
     )
     edges = _trusted_costs(seed, check)
@@ -135,7 +136,7 @@ def _shortcut(path: np.ndarray, check: tuple) -> np.ndarray:
 def _dense(points: np.ndarray, spacing: float) -> np.ndarray:
     """Points along a polyline, at most `spacing` apart, ends included."""
     out = [points[:1]]
-    for a, b in zip(points[:-1], points[1:], strict=True):
+    for a, b in pairwise(points):
         n = max(1, int(np.ceil(np.linalg.norm(b - a) / spacing)))
         out.append(a + (b - a) * (np.arange(1, n + 1) / n)[:, None])
     return np.concatenate(out)

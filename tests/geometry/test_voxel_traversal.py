@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -42,7 +44,7 @@ def test_walk_crosses_what_the_reference_crosses(origin, seed, length):
     got, want = walk(opaque, origin, direction, length), reference.traverse(opaque, origin, direction, length)
     # Rays through an edge may touch one more or one fewer corner voxel within rounding.
     assert len(set(got) ^ set(want)) <= 1 or set(got[:-1]) <= set(want)
-    for a, b in zip(got, got[1:], strict=False):
+    for a, b in pairwise(got):
         assert sum(abs(x - y) for x, y in zip(a, b, strict=True)) == 1
     assert not any(opaque[v] for v in got[:-1])
     assert len(set(got)) == len(got)

@@ -1,0 +1,132 @@
+import box_world
+import numpy as np
+import pytest
+
+from active3d_pipe.geometry import se3
+from active3d_pipe.planning.candidates import coarse_positions, fine_positions, view_directions
+from active3d_pipe.planning.config import PlanningSettings
+from active3d_pipe.planning.free_space import build_free_space, clearance, mark_body
+from active3d_pipe.planning.risk_field import joint_occupancy
+from active3d_pipe.structures import Camera, VoxelGrid
+from active3d_pipe.structures.motion import MotionSettings
+
+MOTION, SETTINGS = MotionSettings(), PlanningSettings()
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """Two rooms after a look around in the first one; (world, volume, pose, walked positions)."""
+    world = box_world.two_rooms()
+    start = np.array([0.8, 0.8, 1.2])
+    for yaw in np.arange(0, 6.28, 0.5):
+        for pitch in (-0.5, 0.3):
+            world.capture(se3.pose_from_yaw_pitch(start, yaw, pitch))
+    return world, world.volume(), se3.pose_from_yaw_pitch(start, 0.0, 0.0), start[None]
+
+
+def arrays(free, hit, occupancy, sdf):
+    one = np.ones((1, 1, 1), np.float32)
+    values = {"free_evidence": free, "hit_evidence": hit, "occupancy": occupancy, "sdf": sdf}
+    return {k: one * np.float32(v) for k, v in values.items()}
+
+
+def test_joint_occupancy_drops_phantoms_fills_gaps_and_distrusts_the_unseen():
+    phantom = joint_occupancy(arrays(60, 0, 0.02, -0.2), SETTINGS)
+    gap = joint_occupancy(arrays(1, 0, 0.4, -0.2), SETTINGS)
+    both_free = joint_occupancy(arrays(30, 0, 0.02, 0.3), SETTINGS)
+    unseen = joint_occupancy(arrays(0, 0, 0.5, 0.3), SETTINGS)
+    assert phantom.item() < 0.15
+    assert gap.item() > 0.8
+    assert both_free.item() < 0.05
+    assert unseen.item() == 1
+
+
+def test_passable_places_are_truly_clear(seen):
+    world, volume, T, walked = seen
+    space = build_free_space(volume, T, walked, MOTION, SETTINGS)
+    ijk = np.argwhere(space.reachable)
+    assert len(ijk) > 500
+    sample = ijk[:: max(1, len(ijk) // 300)]
+    assert world.clearance(space.grid.centre_of(sample)).min() >= MOTION.agent_radius_m
+
+
+def test_clearance_outside_and_unknown_count_as_obstacles():
+    free = np.zeros((9, 9, 9), bool)
+    free[1:8, 1:8, 1:8] = True
+    d = clearance(free, 0.1, 1.0)
+    assert d[4, 4, 4] == pytest.approx(0.35)
+    assert d[0].max() == 0
+    assert clearance(np.ones((5, 5, 5), bool), 0.1, 1.0)[2, 2, 2] == pytest.approx(0.25)
+
+
+def test_body_is_free():
+    grid = VoxelGrid(np.zeros(3), 0.1, (10, 10, 10))
+    free = np.zeros(grid.shape, bool)
+    mark_body(free, grid, np.array([[0.5, 0.5, 0.5], [0.0, 0.0, 0.0]]), 0.2)
+    near = np.linalg.norm(grid.centres() - 0.5, axis=-1) <= 0.2
+    assert free[near].all()
+    assert free[0, 0, 0] and not free[9, 9, 9]
+
+
+def test_geodesic_is_no_shorter_than_the_straight_line_and_follows_passable_voxels(seen):
+    _, volume, T, walked = seen
+    space = build_free_space(volume, T, walked, MOTION, SETTINGS)
+    ijk = np.argwhere(space.reachable)
+    straight = np.linalg.norm(ijk - space.start, axis=1) * space.grid.voxel_size
+    cost = space.cost[tuple(ijk.T)]
+    assert (cost >= straight - 1e-4).all()
+    goal = ijk[cost.argmax()]
+    path = space.grid_path(goal)
+    assert (path[0] == space.start).all() and (path[-1] == goal).all()
+    assert np.abs(np.diff(path, axis=0)).max() == 1
+    assert space.passable[tuple(path.T)].all()
+
+
+def test_risk_is_one_at_the_body_zero_in_the_open_and_never_rises_with_clearance(seen):
+    _, volume, T, walked = seen
+    risk = build_free_space(volume, T, walked, MOTION, SETTINGS).risk
+    order = np.argsort(risk.clearance_m.ravel())
+    assert (np.diff(risk.risk.ravel()[order]) <= 1e-6).all()
+    assert risk.risk[risk.clearance_m <= MOTION.agent_radius_m].min() == 1
+    assert risk.risk[risk.clearance_m >= SETTINGS.preferred_clearance_m].max() == 0
+    outside = risk.at(np.array([[99.0, 0, 0]]))
+    assert (outside[0][0], outside[1][0]) == (1.0, 0.0)
+    v = np.argwhere(risk.clearance_m > 0.2)[7]
+    assert risk.at(risk.grid.centre_of(v)[None])[1][0] == pytest.approx(float(risk.clearance_m[tuple(v)]), abs=1e-6)
+
+
+def test_ground_motion_stays_in_its_layer(seen):
+    _, volume, T, walked = seen
+    space = build_free_space(volume, T, walked, MotionSettings(model="ground"), SETTINGS)
+    layers = np.unique(np.argwhere(space.reachable)[:, 2])
+    assert layers.tolist() == [space.start[2]]
+    assert space.reachable.sum() > 50
+
+
+def test_candidates_cover_all_reachable_space(seen):
+    _, volume, T, walked = seen
+    space = build_free_space(volume, T, walked, MOTION, SETTINGS)
+    coarse = coarse_positions(space, SETTINGS)
+    assert space.reachable[tuple(coarse.T)].all()
+    ijk = np.argwhere(space.reachable)[::7]
+    nearest = np.array([np.linalg.norm(coarse - v, axis=1).min() for v in ijk]) * space.grid.voxel_size
+    assert nearest.max() <= SETTINGS.coarse_spacing_m * 3**0.5
+    few = coarse_positions(space, PlanningSettings(max_positions=5))
+    assert 1 <= len(few) <= 5
+    fine = fine_positions(space, coarse[:2], SETTINGS)
+    assert space.reachable[tuple(fine.T)].all()
+    assert np.abs(fine - coarse[0]).max(axis=1).min() <= 5
+
+
+def test_views_hold_the_rays_in_their_frustum():
+    camera = Camera.from_fov(600, 340, 90)
+    d = view_directions(camera, 24, (0.0,))
+    assert d.solid_angles.sum() == pytest.approx(4 * np.pi, rel=1e-4)
+    # Solid angle of a rectangular pyramid (textbook formula).
+    a, b = 300 / 300, 170 / 300
+    want = 4 * np.arctan(a * b / np.sqrt(1 + a * a + b * b))
+    np.testing.assert_allclose(d.members @ d.solid_angles, want, rtol=0.08)
+    along = d.rays @ d.rotations[3][:, 2]
+    assert d.members[3][along.argmax()] == 1
+    assert d.members[3][along < 0].sum() == 0
+    assert d.angles[0, 1] == pytest.approx(np.radians(15), abs=1e-5)
