@@ -93,6 +93,14 @@ def _landscape(rng: np.random.Generator, n: int, *, town: bool = False) -> np.nd
     return image
 
 
+def broadcast(rng: np.random.Generator, n: int) -> np.ndarray:
+    """What is on television: a landscape with a caption."""
+    image = _landscape(rng, n)
+    image[int(0.82 * n) : int(0.93 * n), int(0.06 * n) : int(0.7 * n)] *= 0.3
+    _text(rng, image, (int(0.84 * n), int(0.92 * n), int(0.08 * n), int(0.68 * n)), (0.95, 0.95, 0.9), height=n // 24)
+    return image
+
+
 def _houses(rng: np.random.Generator, image: np.ndarray, ridge: np.ndarray) -> None:
     """A row of houses with lit windows standing on the ridge line, in place."""
     n = image.shape[0]

@@ -277,7 +277,7 @@ def tv_unit(b: MeshBuilder, look: Look, rng: np.random.Generator, width: float, 
     h = 0.46
     drawers(b, look, look.wood, width, depth, h, rows=1, cols=3)
     with b.placed(0, 0.16, h):
-        monitor(b, look, look.shared.view, min(1.15, 0.8 * width), 0.64, 0.06)
+        monitor(b, look, look.shared.television, min(1.15, 0.8 * width), 0.64, 0.06)
     for s in (-1, 1):
         with b.placed(s * (width / 2 - 0.12), depth / 2, h):
             decor.ornament(b, look, rng, 0.26)

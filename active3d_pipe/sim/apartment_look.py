@@ -48,6 +48,7 @@ class Shared:
     labels: Material
     view: Material
     screen: Material
+    television: Material
     shell: Material
     vases: tuple[Material, ...]
     black: Material
@@ -117,6 +118,7 @@ def make_shared(rng: np.random.Generator) -> Shared:
         labels=Material("labels", art.labels, 1.0, 1024),
         view=Material("window_view", art.view, 1.0, 1024),
         screen=Material("screen", art.screen, 1.0, 512),
+        television=Material("television", art.broadcast, 1.0, 512),
         shell=Material("shell", partial(tex.plaster, colour=(0.7, 0.66, 0.6)), 2.56, 256),
         vases=vases,
         black=Material("plastic", partial(cloth_tex.leather, colour=(0.16, 0.16, 0.17)), 0.64, 256),
@@ -181,11 +183,11 @@ def _walls(kind: str, tag: str, hue: float, rng: np.random.Generator) -> tuple[M
         paper = partial(
             tex.tiles, face=hsv(hue, 0.08, 0.9), other=figure, grout=(0.6, 0.58, 0.55), count=18, layout="brick"
         )
-    plain = partial(tex.plaster, colour=ground, strength=1.5)
+    plain = partial(tex.plaster, colour=ground, strength=1.2)
     papered = Material(f"accent_{tag}", paper, 2.56, 1024)
     if kind != "kitchen" and rng.random() < 0.45:
         return papered, Material(
-            f"wall_{tag}", partial(tex.plaster, colour=hsv(hue, 0.28, 0.74), strength=1.5), 2.56, 1024
+            f"wall_{tag}", partial(tex.plaster, colour=hsv(hue, 0.28, 0.74), strength=1.2), 2.56, 1024
         )
     return Material(f"wall_{tag}", plain, 2.56, 1024), papered
 
