@@ -16,13 +16,16 @@ class RaycastSimulator(SurfaceRenderer):
 
     def __init__(self, scene: Scene, camera: Camera, settings: SensorSettings, seed: int = 0) -> None:
         super().__init__(scene, camera, settings, seed)
-        self._offsets = low_discrepancy_offsets(settings.edge_samples)
+        pattern = low_discrepancy_offsets(settings.edge_samples)
+        self._offsets = (pattern[0::2], pattern[1::2])
+        self._parts = 2 if settings.edge_samples > 1 else 1
 
     def _primary(self, T: np.ndarray) -> Hits:
         return self._cast(self._rays(T, self._all_pixels, self._centres))
 
-    def _samples(self, T: np.ndarray, pixels: np.ndarray) -> tuple[Hits, int]:
-        return self._cast(self._rays(T, pixels, self._offsets)), len(self._offsets)
+    def _samples(self, T: np.ndarray, pixels: np.ndarray, part: int) -> tuple[Hits, int]:
+        offsets = self._offsets[part]
+        return self._cast(self._rays(T, pixels, offsets)), len(offsets)
 
     def _cast(self, rays: np.ndarray) -> Hits:
         """First hits of rays that is not a hole."""

@@ -11,7 +11,10 @@ from active3d_pipe.sim.config import SensorSettings
 from active3d_pipe.sim.scene import Scene
 from active3d_pipe.structures import Camera, Frame, check_pose
 
-_CONTRAST = 3.0  # colour step, 0..255, below which an edge is not worth more samples
+# Colour steps, 0..255. Below the first an edge is not worth more samples (an edge of step s that is not resolved costs a
+# variance of s^2 / 12 in its pixel); from the second on any change of face counts as an edge, for pictures that share a
+# material with what surrounds them; a pixel whose first samples differ by more than the third gets the others too.
+_CONTRAST, _TEXTURE_CONTRAST, _SPREAD = 6.0, 32.0, 12.0
 _CLEARANCE_STEP_M = 0.005
 
 
@@ -31,6 +34,8 @@ class SurfaceRenderer(ABC):
     Colour: one sample at the pixel centre with the texture filtered over the pixel's footprint; pixels at an edge of
     geometry or material are averaged over further samples instead. Depth: exact at the pixel centre.
     """
+
+    _parts = 1  # in how many parts a backend takes the samples of an edge pixel; the later ones only where they differ
 
     def __init__(self, scene: Scene, camera: Camera, settings: SensorSettings, seed: int = 0) -> None:
         self._scene, self._camera, self._settings, self._seed = scene, camera, settings, seed
@@ -59,8 +64,8 @@ class SurfaceRenderer(ABC):
         """Hits of the rays through all pixel centres, row by row."""
 
     @abstractmethod
-    def _samples(self, T: np.ndarray, pixels: np.ndarray) -> tuple[Hits, int]:
-        """Hits of K rays through each of `pixels` (flat indices), pixel by pixel, and K."""
+    def _samples(self, T: np.ndarray, pixels: np.ndarray, part: int) -> tuple[Hits, int]:
+        """Hits of the K rays of a part of the pattern through each of `pixels` (flat), pixel by pixel, and K."""
 
     def render(self, T_world_camera: np.ndarray, *, step: int = 0, stamp_ns: int = 0) -> Frame:
         """See `Simulator.render`."""
@@ -100,28 +105,38 @@ class SurfaceRenderer(ABC):
         rgb, normal = self._shade(T, hits, 1.0)
         if self._settings.edge_samples == 0:
             return rgb
-        marked = np.empty(len(rgb), np.uint8)
-        face_material = self._packed.arrays[2]
-        kernels.edge_pixels(
-            hits.rays, hits.t, hits.face, normal, rgb, face_material, np.float32(_CONTRAST), camera.width, camera.height,
-            marked,
+        contrast = np.empty((camera.height, camera.width), np.uint8)
+        steps = np.empty((2, camera.height, camera.width), np.float32)
+        kernels.edge_contrast(
+            hits.rays, hits.t, hits.face, normal, rgb, self._packed.arrays[2], np.float32(_CONTRAST),
+            np.float32(_TEXTURE_CONTRAST), steps, contrast,
         )
-        pixels = np.flatnonzero(marked)
+        pixels = np.flatnonzero(contrast)
+        total, count = np.zeros((len(pixels), 3), np.float32), np.zeros(len(pixels), np.float32)
+        doubtful = np.arange(len(pixels))
+        for part in range(self._parts):
+            if len(doubtful) == 0:
+                break
+            samples, k = self._samples(T, pixels[doubtful], part)
+            colours, _ = self._shade(T, samples, 1 / np.sqrt(k), shading.SAMPLE_PROBES)
+            sums, spread = np.empty((len(doubtful), 3), np.float32), np.empty(len(doubtful), np.float32)
+            kernels.sum_samples(colours.reshape(len(doubtful), k, 3), sums, spread)
+            total[doubtful] += sums
+            count[doubtful] += k
+            doubtful = doubtful[spread > _SPREAD]
         if len(pixels):
-            samples, count = self._samples(T, pixels)
-            colours, _ = self._shade(T, samples, 1 / np.sqrt(count))
-            kernels.average_samples(pixels, colours.reshape(len(pixels), count, 3), rgb)
+            rgb[pixels] = total / count[:, None]
         return rgb
 
-    def _shade(self, T: np.ndarray, hits: Hits, footprint: float) -> tuple[np.ndarray, np.ndarray]:
+    def _shade(self, T: np.ndarray, hits: Hits, footprint: float, probes: int = shading.MAX_PROBES) -> tuple[np.ndarray, np.ndarray]:
         """Colours and normals (N, 3) float32 of hits whose samples are `footprint` pixels wide."""
         right = (T[:3, 0] * (footprint / self._camera.fx)).astype(np.float32)
         down = (T[:3, 1] * (footprint / self._camera.fy)).astype(np.float32)
         rgb = np.empty((len(hits.t), 3), np.float32)
         normal = np.empty((len(hits.t), 3), np.float32)
         kernels.shade(
-            hits.rays, hits.t, hits.face, hits.bary, right, down, self._packed.arrays,
-            np.float32(shading.TEXTURE_BIAS), shading.MAX_PROBES, rgb, normal,
+            hits.rays, hits.t, hits.face, hits.bary, right, down, np.float32(shading.TEXTURE_BIAS), probes,
+            rgb, normal, *self._packed.arrays,
         )
         return rgb, normal
 

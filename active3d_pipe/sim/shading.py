@@ -25,8 +25,10 @@ LIGHTS = np.array(
 OCCLUSION = np.array([[0.15, 0.14], [0.4, 0.14], [1.0, 0.16]], dtype=np.float32)
 CREASE_DEG = 40.0
 _MAX_CELLS = 400_000
-TEXTURE_BIAS = -0.5
+# Chosen for the smallest error against 6 x 6 supersampling on five furnished scenes; -1 aliases, 0 blurs (2 dB either way).
+TEXTURE_BIAS = -0.6
 MAX_PROBES = 8
+SAMPLE_PROBES = 2  # for samples of an edge pixel, which average one another
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +38,7 @@ class PackedScene:
     Attributes:
         arrays: vertices (V, 3) f32, faces (F, 3) i32, face_material (F,) i32, uv (F, 3, 2) f32 or (0, 3, 2), corner
             normals (F, 3, 3) i16, vertex colours (V, 3) u8 or (0, 3), base colours (M, 3) f32 in 0..1, mip_range (M, 2)
-            i64 rows of `levels`, levels (L, 3) i64 = offset, width, height, texels (T, 4) u8, lights (K, 4) f32,
+            i64 rows of `levels`, levels (L, 3) i64 = offset, width, height, texels (T,) i32, lights (K, 4) f32,
             occlusion (K, 2) f32, distance grid [X, Y, Z] f32 m, its origin (3,) f32 and 1 / voxel size f32.
         cutoff: (M,) f32 alpha below which a texel is a hole, 0..255, -1 = none.
     """
@@ -60,7 +62,7 @@ def pack(scene: Scene, surface: SurfaceIndex) -> PackedScene:
         for image in material.mips:
             height, width = image.shape[:2]
             levels.append((offset, width, height))
-            texels.append(image.reshape(-1, 4))
+            texels.append(image)
             offset += width * height
         mip_range.append((first, len(levels)))
     cutoff = [-1.0 if m.alpha_cutoff is None or not m.mips else 255 * m.alpha_cutoff for m in scene.materials]
@@ -75,10 +77,16 @@ def pack(scene: Scene, surface: SurfaceIndex) -> PackedScene:
         np.array([m.base_color for m in scene.materials], dtype=np.float32),
         np.array(mip_range, dtype=np.int64),
         np.array(levels, dtype=np.int64).reshape(-1, 3),
-        np.concatenate(texels) if texels else np.zeros((1, 4), np.uint8),
+        pack_texels(texels),
         LIGHTS, OCCLUSION, grid, origin, inv_voxel,
     )
     return PackedScene(arrays, np.array(cutoff, dtype=np.float32))
+
+
+def pack_texels(images: list[np.ndarray]) -> np.ndarray:
+    """(T,) int32 texels of RGBA images (h, w, 4) uint8, row by row: red in the lowest byte, alpha in the highest."""
+    flat = [image.reshape(-1, 4).astype(np.uint32) @ np.array([1, 1 << 8, 1 << 16, 1 << 24], np.uint32) for image in images]
+    return (np.concatenate(flat) if flat else np.zeros(1, np.uint32)).view(np.int32)
 
 
 def distance_grid(surface: SurfaceIndex, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.float32]:
