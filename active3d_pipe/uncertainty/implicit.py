@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.special import ndtr
 
+from active3d_pipe.information.entropy import bernoulli_entropy
 from active3d_pipe.uncertainty.config import UncertaintySettings
 
 
@@ -38,14 +39,36 @@ def cube_support(sdf: np.ndarray, voxel_size: float) -> np.ndarray:
 
 
 def implicit_occupancy(
-    sdf: np.ndarray, sigma: np.ndarray, observed: np.ndarray, voxel_size: float, settings: UncertaintySettings
+    sdf: np.ndarray, sigma: np.ndarray, observed: np.ndarray, support: np.ndarray, settings: UncertaintySettings
 ) -> np.ndarray:
     """P(voxel holds surface or solid) by the field, float32 [X, Y, Z].
 
     SDF(centre) ~ N(sdf, sigma^2), so P = Phi((support - sdf) / sigma), see `cube_support`: depth rays that end in a
-    voxel and the field then speak of the same event. A well known surface has P near 1 and little entropy; a band
-    of fixed width would leave every surface voxel undecided for ever. Prior 0.5 where nothing was observed.
+    voxel and the field then speak of the same event. Prior 0.5 where nothing was observed.
+    """
+    p = ndtr((support - sdf) / np.maximum(sigma, np.float32(settings.sigma_floor_m)))
+    return (0.5 + observed * (p - 0.5)).astype(np.float32)
+
+
+# Integral of H[Phi(z)] from 0 to z: the entropy of a sign whose mean lies z standard deviations from zero.
+_Z = np.linspace(-8, 8, 4097)
+_H = bernoulli_entropy(ndtr(_Z))
+_INTEGRAL = np.concatenate([[0], np.cumsum((_H[1:] + _H[:-1]) / 2 * np.diff(_Z))])
+_INTEGRAL = _INTEGRAL - _INTEGRAL[len(_Z) // 2]
+
+
+def implicit_entropy(
+    sdf: np.ndarray, sigma: np.ndarray, observed: np.ndarray, support: np.ndarray, settings: UncertaintySettings
+) -> np.ndarray:
+    """H[p_F(v)] of eq. hybrid_entropy before masking, bits in 0..1, float32 [X, Y, Z].
+
+    The mean over the voxel of the entropy of P(SDF(x) < 0) under N(SDF(x), sigma^2), taken along the surface normal,
+    where the SDF runs through sdf - support .. sdf + support. It is near 2.2 sigma / voxel_size in a surface voxel
+    and falls with sigma towards 0. The entropy of `implicit_occupancy` would not: where a wall runs along the border
+    between two voxels, whether it touches one of them stays a coin toss that no view can settle.
+    1 where nothing was observed.
     """
     scale = np.maximum(sigma, np.float32(settings.sigma_floor_m))
-    p = ndtr((cube_support(sdf, voxel_size) - sdf) / scale)
-    return (0.5 + observed * (p - 0.5)).astype(np.float32)
+    area = np.interp((sdf + support) / scale, _Z, _INTEGRAL) - np.interp((sdf - support) / scale, _Z, _INTEGRAL)
+    h = np.clip(area * scale / (2 * support), 0, 1)
+    return (1 - observed * (1 - h)).astype(np.float32)

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.special import ndtr
 from uncertainty_room import field, gaussians_on, room_grid
 
 from active3d_pipe.geometry import se3
@@ -33,12 +34,13 @@ def evidence(free, hit):
 def test_probabilities_and_entropies_stay_in_range(free, hit, sdf, sigma, mass):
     e = evidence(free, hit)
     seen = occupancy.observation(e, S)
-    p_imp = implicit.implicit_occupancy(sdf, sigma, seen, 0.1, S)
+    p_imp = implicit.implicit_occupancy(sdf, sigma, seen, implicit.cube_support(sdf, 0.1), S)
+    h_imp = implicit.implicit_entropy(sdf, sigma, seen, implicit.cube_support(sdf, 0.1), S)
     log_odds = occupancy.explicit_log_odds(e, mass, S)
     o = occupancy.hybrid_occupancy(log_odds, p_imp, e, S)
     u = implicit.implicit_uncertainty(sigma, seen, S)
     a = occupancy.attention(e, S)
-    for volume in (seen, p_imp, o, u, a, bernoulli_entropy(p_imp), bernoulli_entropy(occupancy.expit(log_odds))):
+    for volume in (seen, p_imp, h_imp, o, u, a, bernoulli_entropy(occupancy.expit(log_odds))):
         assert np.isfinite(volume).all()
         assert volume.min() >= 0
         assert volume.max() <= 1
@@ -46,6 +48,7 @@ def test_probabilities_and_entropies_stay_in_range(free, hit, sdf, sigma, mass):
     assert (o[unseen] == 0.5).all()
     assert (p_imp[unseen] == 0.5).all()
     assert (u[unseen] == 1).all()
+    assert (h_imp[unseen] == 1).all()
     assert (a[unseen] == 1).all()
 
 
@@ -88,16 +91,35 @@ def test_cube_support_is_the_cubes_own():
     np.testing.assert_allclose(implicit.cube_support(np.full((4, 4, 4), 0.1, np.float32), 0.1), 0.05)
 
 
-def test_a_well_known_field_is_sure_of_most_voxels():
+def test_a_well_known_field_is_sure():
     grid = room_grid()
     sdf, sigma = (a.reshape(grid.shape) for a in field(grid.centres().reshape(-1, 3), sigma=0.005))
-    p = implicit.implicit_occupancy(sdf, sigma, np.ones_like(sdf), 0.1, S)
+    support, seen = implicit.cube_support(sdf, 0.1), np.ones_like(sdf)
+    p = implicit.implicit_occupancy(sdf, sigma, seen, support, S)
     assert (p[sdf < 0] > 0.99).all()
     assert (p[sdf >= 0.0999] < 0.1).all()
     assert np.median(p[sdf >= 0.0999]) < 0.01
-    assert bernoulli_entropy(p).mean() < 0.1
-    vague = implicit.implicit_occupancy(sdf, sigma + np.float32(0.3), np.ones_like(sdf), 0.1, S)
-    assert bernoulli_entropy(vague).mean() > 0.8
+    assert implicit.implicit_entropy(sdf, sigma, seen, support, S).max() < 0.3
+    assert implicit.implicit_entropy(sdf, sigma + np.float32(0.3), seen, support, S).min() > 0.8
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(-0.2, 0.2), st.floats(0.01, 1.0), st.floats(0.05, 0.087))
+def test_field_entropy_is_the_mean_over_the_voxel(sdf, sigma, support):
+    x = sdf + support * np.linspace(-1, 1, 4001)
+    h = bernoulli_entropy(ndtr(-x / sigma)).mean()
+    one = [np.array([v]) for v in (sdf, sigma, 1.0, support)]
+    assert implicit.implicit_entropy(*one, S)[0] == pytest.approx(h, abs=2e-3)
+
+
+def test_field_entropy_does_not_depend_on_where_the_grid_cuts_a_wall():
+    """A wall in the middle of a voxel, or on the border of two: the doubt in the row of voxels is the same."""
+    totals = []
+    for offset in np.linspace(0, 0.05, 6):
+        sdf = np.arange(-0.4, 0.45, 0.1) + offset
+        ones = np.ones_like(sdf)
+        totals.append(implicit.implicit_entropy(sdf, 0.02 * ones, ones, 0.05 * ones, S).sum())
+    np.testing.assert_allclose(totals, totals[0], rtol=1e-3)
 
 
 def slow_mass(grid, g):
