@@ -2,12 +2,14 @@
 
     <stage>/.tmp-round_0007/   being written; removed when the next writer opens the run
     <stage>/round_0007/        committed: holds `record.json`
-    <stage>/.old-round_0007/   what a replacement moved out of the way; put back if the new one never arrived
+    <stage>/.old-round_0007/   what a replacement moved out of the way, where names cannot be swapped in one step;
+                               put back if the new one never arrived
 
 A committed artifact is never written to. Replacing or pruning one swaps the whole folder.
 """
 
 import json
+import os
 import re
 from pathlib import Path
 
@@ -117,10 +119,15 @@ class ArtifactStore:
 
     @staticmethod
     def _swap_in(aside: Path, final: Path) -> None:
-        old = final.with_name(OLD + final.name)
-        if final.exists() or final.is_symlink():
+        if not os.path.lexists(final):
+            files.rename(aside, final)
+            files.sync_folder(final.parent)
+        elif files.exchange(aside, final):  # now the old artifact has the unfinished one's name
+            files.sync_folder(final.parent)
+            files.remove_tree(aside)
+        else:
+            old = final.with_name(OLD + final.name)
             files.rename(final, old)
-        files.rename(aside, final)
-        files.sync_folder(final.parent)
-        if old.exists() or old.is_symlink():
+            files.rename(aside, final)
+            files.sync_folder(final.parent)
             files.remove_tree(old)

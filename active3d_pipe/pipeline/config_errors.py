@@ -25,7 +25,7 @@ def explain(error: ValidationError, layers: Layers, model: type[BaseModel]) -> s
     for line in lines:
         if line in best:
             value = _lookup(layers.values, line)
-            expected = " or ".join(dict.fromkeys(best[line]))
+            expected = " or ".join(dict.fromkeys(best[line])).replace(" or expected ", " or ")
             said.append(f"{line} = {_show(value)} ({layers.source_of(line)}): {expected}")
         else:
             said.append(line)

@@ -4,10 +4,12 @@ Every operation that changes a run folder passes through here, so that the crash
 before any one of them (`ACTIVE3D_TEST_CRASH_AT=n`), and so that an OSError becomes one clear line.
 """
 
+import ctypes
 import errno
 import hashlib
 import os
 import shutil
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +19,8 @@ from active3d_pipe.errors import AccessError, Active3dError, DiskError, OutputEr
 CRASH_AT = "ACTIVE3D_TEST_CRASH_AT"
 CRASH_EXIT_CODE = 137
 _operations = 0
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2
+_renameat2 = getattr(ctypes.CDLL(None), "renameat2", None) if sys.platform == "linux" else None
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
@@ -38,10 +42,11 @@ def explain(error: OSError, where: Path | str) -> Active3dError:
     if isinstance(error, Active3dError):
         return error
     place = error.filename or where
-    if error.errno in _FULL:
+    if error.errno in _FULL or error.errno is None:  # without a number: NumPy's report of a short write
+        what = error if error.errno is None else os.strerror(error.errno)
         return DiskError(
-            f"cannot write {place}: {os.strerror(error.errno or 0)}; free some space and go on with "
-            "`active3d resume` (nothing that was committed is harmed)"
+            f"cannot write {place}: {what}; free some space and go on with `active3d resume` "
+            "(nothing that was committed is harmed)"
         )
     if error.errno in (errno.EACCES, errno.EPERM):
         return AccessError(f"no permission to write {place}; change its mode, or choose another folder with --out")
@@ -115,6 +120,14 @@ def rename(source: Path, target: Path) -> None:
     """Rename within one folder; the folder is not synced."""
     failpoint()
     os.rename(source, target)
+
+
+def exchange(first: Path, second: Path) -> bool:
+    """Swap two names in one step, so that neither is ever absent; False where the system cannot."""
+    failpoint()
+    if _renameat2 is None:
+        return False
+    return _renameat2(_AT_FDCWD, os.fsencode(first), _AT_FDCWD, os.fsencode(second), _RENAME_EXCHANGE) == 0
 
 
 def remove_tree(path: Path) -> None:

@@ -95,7 +95,7 @@ class Runner:
                     continue
                 self._execute(node, last, "forced" if state.state.is_hit else "; ".join(state.reasons), stop)
             if self._executed:
-                self._prune(last)
+                self._prune(self.last_round())
             return Outcome(self.ended(last), last, tuple(self._executed))
 
     def dry_run(
@@ -256,12 +256,13 @@ class Runner:
 
     def _warn_of_stale_inputs(self, nodes: list[NodeId], last: int) -> None:
         states = self.surveyor.survey(last)
-        for wanted in self.registry.inputs(nodes[0], last):
-            state = states.get(wanted)
-            if state is not None and state.state is State.STALE:
-                why = state.reasons[0]
-                self.watcher.say(f"{wanted} is stale ({why}) and is used as it is; `active3d resume` renews it")
-                return
+        inputs = self.registry.inputs(nodes[0], last)
+        stale = [states[name] for name in inputs if name in states and states[name].state is State.STALE]
+        # The one with a reason of its own tells more than those that merely follow.
+        stale.sort(key=lambda state: state.reasons[0].startswith("follows "))
+        if stale:
+            said = f"{stale[0].node} is stale ({stale[0].reasons[0]}) and is used as it is"
+            self.watcher.say(f"{said}; `active3d resume` renews it")
 
     def _recover(self) -> None:
         """Tidy up after a crash: unfinished folders go, artifacts whose journal line was lost get one."""

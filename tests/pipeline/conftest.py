@@ -56,7 +56,7 @@ def snapshot(path: Path) -> dict[str, bytes]:
     return {
         p.relative_to(path).as_posix(): p.read_bytes()
         for p in sorted(path.rglob("*"))
-        if p.is_file() and p.name not in ("journal.jsonl", "run.lock") and not p.relative_to(path).parts[0] == "report"
+        if p.is_file() and p.name not in ("journal.jsonl", "run.lock") and p.relative_to(path).parts[0] != "report"
     }
 
 
