@@ -1,6 +1,7 @@
 """Printing: one JSON document or plain text to stdout, everything else to stderr."""
 
 import json
+import os
 import sys
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -12,13 +13,16 @@ def say(text: str) -> None:
 
 
 def out(text: str) -> None:
-    """The answer to a command, on stdout."""
-    print(text)
+    """The answer to a command, on stdout; when its reader has gone (`| head`), the rest goes nowhere."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def out_json(document: Any) -> None:
     """The answer as the one JSON document on stdout."""
-    print(json.dumps(document, indent=2))
+    out(json.dumps(document, indent=2))
 
 
 def table(rows: Iterable[Sequence[str]], header: Sequence[str] = ()) -> str:

@@ -1,6 +1,5 @@
 """`active3d`: the entry point. Every error is one line and an exit code (`docs/commands.md`)."""
 
-import os
 import sys
 import traceback
 from pathlib import Path
@@ -52,7 +51,6 @@ def main() -> None:
 def _main(arguments: list[str]) -> int:
     try:
         code = typer.main.get_command(app).main(args=arguments, prog_name="active3d", standalone_mode=False)
-        sys.stdout.flush()
         return code if isinstance(code, int) else 0
     except Active3dError as error:
         _trace()
@@ -62,10 +60,6 @@ def _main(arguments: list[str]) -> int:
     except (KeyboardInterrupt, typer.Abort):
         console.say("active3d: stopped at once; everything committed is kept")
         return 130
-    except BrokenPipeError:
-        # Whoever read our output has gone: `active3d status | head`.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
     except Exception as error:
         if hasattr(error, "format_message"):  # a usage error of the command line itself
             console.say(f"active3d: {' '.join(error.format_message().split())} (see active3d --help)")

@@ -108,9 +108,10 @@ class RunDir:
         """Read `manifest.json`."""
         path = self.path / MANIFEST
         try:
-            return Manifest.from_bytes(path.read_bytes(), path)
+            data = path.read_bytes()
         except OSError as error:
             raise ArtifactError(f"{path}: cannot be read: {error.strerror}") from error
+        return Manifest.from_bytes(data, path)
 
     def write(self, toml: str, manifest: Manifest) -> None:
         """Write `run.toml`, then `manifest.json`; files that hold these bytes already are left alone."""

@@ -121,7 +121,8 @@ def _start(path: Path, tmp_path: Path, sleep: float, *more: str) -> subprocess.P
     (tmp_path / "room.glb").touch()
     command = [
         sys.executable, str(DRIVE), "run", "default", "--out", str(path),
-        "--set", f"scene.file={tmp_path / 'room.glb'}", "--set", "run.steps=10", "--set", "camera.height=8", "--set", "run.name=crash", *more,
+        "--set", f"scene.file={tmp_path / 'room.glb'}", "--set", "run.steps=10",
+        "--set", "camera.height=8", "--set", "run.name=crash", *more,
     ]
     environment = {**os.environ, SLEEP: str(sleep)}
     return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
