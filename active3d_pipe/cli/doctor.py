@@ -79,8 +79,12 @@ def _gl() -> Iterator[Finding]:
 
 
 def _threads() -> Iterator[Finding]:
+    import warnings
+
     import numba
     import torch
+
+    warnings.filterwarnings("ignore", category=numba.NumbaWarning)  # about threading layers that are not used
 
     @numba.njit(parallel=True)
     def total(n: int) -> int:

@@ -139,7 +139,7 @@ class Bar:
         left = self.tally.remaining()
         self._progress.update(
             self._task, completed=min(self.tally.steps, self.tally.budget), text=self.tally.text(),
-            eta="" if left is None else f"ETA {seconds(left)}",
+            eta="" if left is None or self.tally.steps >= self.tally.budget else f"ETA {seconds(left)}",
         )
 
     def say(self, text: str) -> None:

@@ -34,7 +34,7 @@ def parse_slice(text: str | None, grid: VoxelGrid) -> Slice:
     low, high = grid.low[i], grid.high[i]
     if not low <= metres <= high:
         raise ConfigError(f"--slice {text}: the volume spans {axis} = {low:.2f} to {high:.2f} m")
-    index = min(int((metres - low) / grid.voxel_size), grid.shape[i] - 1)
+    index = min(int((metres - low) / grid.voxel_size + 1e-9), grid.shape[i] - 1)
     return Slice(axis, index, float(grid.axis(i)[index]))
 
 

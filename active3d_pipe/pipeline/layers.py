@@ -118,6 +118,8 @@ def _read_base(layers: Layers, base: str, seen: tuple[str, ...]) -> None:
     path = Path(base)
     if path.suffix == ".toml" or path.is_file():
         table, source, layers_folder = read_toml(path), str(path), path.resolve().parent
+        if any(Path(name).resolve() == path.resolve() for name in seen if name.endswith(".toml")):
+            raise ConfigError(f"{source}: `preset` leads back to itself ({' -> '.join((*seen, source))})")
     else:
         table, source, layers_folder = _read_preset(base), f"preset {base}", None
     if source in seen:
@@ -126,7 +128,8 @@ def _read_base(layers: Layers, base: str, seen: tuple[str, ...]) -> None:
     if below is not None:
         if not isinstance(below, str):
             raise ConfigError(f"{source}: preset = {below!r}; expected the name of a preset, as in preset = \"demo\"")
-        _read_base(layers, below, (*seen, source))
+        beside = layers_folder / below if layers_folder is not None and below.endswith(".toml") else None
+        _read_base(layers, str(beside) if beside is not None and beside.is_file() else below, (*seen, source))
     layers.merge(table, source)
     layers.name = path.stem
     layers.folder = layers_folder or layers.folder

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from active3d_pipe.pipeline.config import Config
@@ -118,6 +118,7 @@ _json = st.recursive(
 )
 
 
+@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.dictionaries(st.text(max_size=4), _json, max_size=4))
 def test_canonical_json_does_not_depend_on_order(value: dict) -> None:
     turned = dict(reversed(list(value.items())))
