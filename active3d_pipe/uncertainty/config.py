@@ -13,7 +13,9 @@ class UncertaintySettings(Settings):
     """How evidence is gathered and how the three terms are formed and fused (paper, sec. uncertainty_map)."""
 
     voxel_size_m: float = Field(0.1, gt=0, description="edge of a voxel of every volume, m")
-    margin_m: float = Field(0.0, ge=0, description="border that the grid adds around the given bounds, m")
+    margin_m: float = Field(
+        0.1, ge=0, description="border that the grid adds, so that walls on the border of the bounds lie inside it, m"
+    )
 
     # Free and hit evidence from depth rays
     ray_stride: int = Field(4, ge=1, description="every n-th pixel in x and y casts a ray into the grid")
@@ -35,8 +37,6 @@ class UncertaintySettings(Settings):
     sigma_floor_m: float = Field(0.01, gt=0, description="least field sigma believed for occupancy, m")
 
     # Explicit term
-    examined_views: int = Field(12, ge=1, description="keyframes rendered with the map, candidates of C_high")
-    predicted_views: int = Field(6, ge=1, description="new frames that the previous map predicts, for the fusion")
     top_k_views: int = Field(8, ge=1, description="size of C_high: most uncertain views that form u_exp")
     residual_stride: int = Field(2, ge=1, description="every n-th pixel of a residual image is back-projected")
     depth_residual_scale_m: float = Field(0.05, gt=0, description="depth error that counts as 63 percent, m")

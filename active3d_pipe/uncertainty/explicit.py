@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from active3d_pipe.errors import InputError
-from active3d_pipe.structures import Camera, Frame, VoxelGrid
+from active3d_pipe.structures import Camera, VoxelGrid
 from active3d_pipe.structures.frame import check_pose
 from active3d_pipe.uncertainty import kernels
 from active3d_pipe.uncertainty.carving import by_image_size, intrinsics
@@ -76,30 +76,6 @@ def view_residuals(
     if not (np.isfinite(depth_error).all() and np.isfinite(color_error).all()):
         raise InputError("view residual: the rendering holds NaN or infinite values where depth is valid")
     return ViewResidual(camera, np.asarray(T_world_camera, np.float64), depth, depth_error, color_error)
-
-
-def frame_residual(
-    rendered_rgb: np.ndarray, rendered_depth: np.ndarray, rendered_alpha: np.ndarray, frame: Frame
-) -> ViewResidual:
-    """`view_residuals` of a rendering at the frame's pose, at full resolution or reduced by a whole factor.
-
-    At a reduced resolution the observed colour is averaged over the pixels that a rendered pixel covers, and the
-    observed depth is that of the pixel at its middle: depth must not be averaged across an edge.
-    """
-    height, width = rendered_depth.shape
-    factor = frame.camera.width // width if width else 0
-    if factor < 1 or (height * factor, width * factor) != frame.depth.shape:
-        raise InputError(
-            f"view residual: the rendering is {(height, width)}, expected the frame's {frame.depth.shape} or a whole "
-            "fraction of it"
-        )
-    rgb, depth, camera = frame.rgb, frame.depth, frame.camera
-    if factor > 1:
-        blocks = rgb.reshape(height, factor, width, factor, 3).astype(np.float32)
-        rgb = blocks.mean(axis=(1, 3)) * np.float32(1 / 255)
-        depth = depth[factor // 2 :: factor, factor // 2 :: factor]
-        camera = camera.scaled(1 / factor)
-    return view_residuals(rendered_rgb, rendered_depth, rendered_alpha, rgb, depth, camera, frame.T_world_camera)
 
 
 def most_uncertain(views: Sequence[ViewResidual], settings: UncertaintySettings) -> list[int]:

@@ -76,56 +76,54 @@ def _clip(o, d, n, t0, t1):
 
 
 @njit(cache=True, inline="always")
-def _start(o, d, n, t0):
-    """First voxel index, step, parameter of the first border and between borders, along one axis."""
+def _start(o, d, n, t0, pitch):
+    """Along one axis: first index, memory step, steps left in the grid, parameter of the first border, of a voxel."""
     i = min(max(math.floor(o + t0 * d), 0), n - 1)
     if d > 0.0:
-        return i, 1, (i + 1 - o) / d, 1.0 / d
+        return i, pitch, n - 1 - i, (i + 1 - o) / d, 1.0 / d
     if d < 0.0:
-        return i, -1, (i - o) / d, -1.0 / d
-    return i, 0, math.inf, math.inf
+        return i, -pitch, i, (i - o) / d, -1.0 / d
+    return i, 0, 0, math.inf, math.inf
 
 
 @njit(cache=True)
-def _count_free(ox, oy, oz, ex, ey, ez, free, stamp, frame_id):
+def _count_free(ox, oy, oz, ex, ey, ez, shape, free, stamp, frame_id):
     """Add 1 to every voxel that the segment o -> e (voxel units) crosses and that no ray of this frame hit.
 
-    Incremental traversal of Amanatides and Woo (1987).
+    Incremental traversal of Amanatides and Woo (1987) on flat volumes of `shape`.
     """
-    nx, ny, nz = free.shape
+    nx, ny, nz = shape
     dx, dy, dz = ex - ox, ey - oy, ez - oz
     t0, t1 = _clip(ox, dx, nx, 0.0, 1.0)
     t0, t1 = _clip(oy, dy, ny, t0, t1)
     t0, t1 = _clip(oz, dz, nz, t0, t1)
     if t0 >= t1:
         return
-    i, si, ti, gi = _start(ox, dx, nx, t0)
-    j, sj, tj, gj = _start(oy, dy, ny, t0)
-    k, sk, tk, gk = _start(oz, dz, nz, t0)
+    i, si, left_i, ti, gi = _start(ox, dx, nx, t0, ny * nz)
+    j, sj, left_j, tj, gj = _start(oy, dy, ny, t0, nz)
+    k, sk, left_k, tk, gk = _start(oz, dz, nz, t0, 1)
+    v = (i * ny + j) * nz + k
     while True:
-        if stamp[i, j, k] != frame_id:
-            free[i, j, k] += 1
+        if stamp[np.uintp(v)] != frame_id:
+            free[np.uintp(v)] += np.int32(1)
         if ti <= tj and ti <= tk:
-            if ti >= t1:
+            if ti >= t1 or left_i == 0:
                 return
-            i += si
+            left_i -= 1
+            v += si
             ti += gi
-            if i < 0 or i >= nx:
-                return
         elif tj <= tk:
-            if tj >= t1:
+            if tj >= t1 or left_j == 0:
                 return
-            j += sj
+            left_j -= 1
+            v += sj
             tj += gj
-            if j < 0 or j >= ny:
-                return
         else:
-            if tk >= t1:
+            if tk >= t1 or left_k == 0:
                 return
-            k += sk
+            left_k -= 1
+            v += sk
             tk += gk
-            if k < 0 or k >= nz:
-                return
 
 
 @njit(cache=True)
@@ -150,12 +148,13 @@ def _carve_frame(depth, camera, pose, reach, start, stride, grid, footprint, fre
                 q = np.float32(cosine * min(1.0, footprint * camera[0] / d))
                 quality[x, y, z] = max(quality[x, y, z], q)
     ox, oy, oz = _pixel_end(0, 0, 0.0, camera, pose, origin, inv_voxel)
+    flat_free, flat_stamp = free.ravel(), stamp.ravel()
     for i in range(start[0], height, stride):
         for j in range(start[1], width, stride):
             d = depth[i, j]
             if d >= near and d > 0.0 and d < math.inf:
                 ex, ey, ez = _pixel_end(i, j, min(d, far), camera, pose, origin, inv_voxel)
-                _count_free(ox, oy, oz, ex, ey, ez, free, stamp, frame_id)
+                _count_free(ox, oy, oz, ex, ey, ez, free.shape, flat_free, flat_stamp, frame_id)
 
 
 @njit(parallel=True, cache=True)

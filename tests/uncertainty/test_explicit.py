@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from uncertainty_room import CAMERA, colour_image, frame, frames, pose, residual, room_grid
+from uncertainty_room import CAMERA, frame, frames, pose, residual, room_grid
 
 from active3d_pipe.errors import InputError
 from active3d_pipe.geometry import projection
 from active3d_pipe.structures import Camera
-from active3d_pipe.uncertainty import UncertaintySettings, backproject, frame_residual, view_residuals
+from active3d_pipe.uncertainty import UncertaintySettings, backproject, view_residuals
 from active3d_pipe.uncertainty.explicit import MIN_WEIGHT, explicit_uncertainty, most_uncertain
 
 S = UncertaintySettings()
@@ -67,19 +67,6 @@ def test_a_hole_in_the_map_is_as_wrong_as_can_be():
     )
     np.testing.assert_allclose(hole.depth_error, f.depth)
     assert hole.normalised(S).min() > 0.5
-
-
-def test_a_reduced_rendering_meets_the_reduced_frame():
-    T = pose(0)
-    f = frame(0, T)
-    small = CAMERA.scaled(0.5)
-    exact = frame(0, T, small)
-    got = frame_residual(colour_image(T, small) / np.float32(255), exact.depth, np.ones((30, 40)), f)
-    assert got.camera.width == 40
-    assert np.median(got.depth_error) < 0.02
-    assert np.median(got.color_error) < 0.03
-    with pytest.raises(InputError, match="whole fraction"):
-        frame_residual(np.zeros((33, 44, 3)), np.ones((33, 44)), np.ones((33, 44)), f)
 
 
 @pytest.mark.parametrize("stride", [1, 2, 3])
