@@ -20,10 +20,12 @@ from numba import njit, prange, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from active3d_pipe.gaussians.kernels_lanes import FLOAT, LANES, VECTOR, Lanes, arranged, lane_order
+
 TW, TH = 16, 16
-LANES = 8
 STRIPS = TW // LANES
 F = np.float32
+_float, _vector, _i64 = FLOAT, VECTOR, ir.IntType(64)
 ZERO, HALF, ONE = F(0), F(0.5), F(1)
 ALPHA_MAX = 0.99
 STOP_EVERY = 16
@@ -35,92 +37,13 @@ FORWARD_GROUP, BACKWARD_GROUP = FORWARD_PLANES * LANES, BACKWARD_PLANES * LANES
 EXP_POLY = (0.00582640022, 0.0397533720, 0.165975796, 0.499888322, 0.999993988, 1.0)
 Y_MIN = -0.75
 
-_float, _vector, _i64 = ir.FloatType(), ir.VectorType(ir.FloatType(), LANES), ir.IntType(64)
-
-
-class _Lanes:
-    """Arithmetic on <8 x float> values with a readable notation; one instance per emitted function."""
-
-    def __init__(self, builder):
-        self.builder = builder
-
-    def constant(self, values):
-        values = [values] * LANES if np.isscalar(values) else values
-        return ir.Constant(_vector, [ir.Constant(_float, float(F(v))) for v in values])
-
-    def splat(self, scalar):
-        b = self.builder
-        first = b.insert_element(ir.Constant(_vector, ir.Undefined), scalar, ir.Constant(ir.IntType(32), 0))
-        zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
-        return b.shuffle_vector(first, ir.Constant(_vector, ir.Undefined), zeros)
-
-    def add(self, x, y):
-        return self.builder.fadd(x, y, flags=("fast",))
-
-    def sub(self, x, y):
-        return self.builder.fsub(x, y, flags=("fast",))
-
-    def mul(self, x, y):
-        return self.builder.fmul(x, y, flags=("fast",))
-
-    def div(self, x, y):
-        return self.builder.fdiv(x, y, flags=("fast",))
-
-    def mul_add(self, x, y, z):
-        return self.add(self.mul(x, y), z)
-
-    def where(self, comparison, x, y, yes, no):
-        """yes where x (comparison) y, else no."""
-        return self.builder.select(self.builder.fcmp_ordered(comparison, x, y), yes, no)
-
-    def load(self, base, plane):
-        return self.builder.load(self._address(base, plane), align=4)
-
-    def store(self, value, base, plane):
-        self.builder.store(value, self._address(base, plane), align=4)
-
-    def _address(self, base, plane):
-        pointer = self.builder.gep(base, [_i64(plane * LANES)])
-        return self.builder.bitcast(pointer, _vector.as_pointer())
-
-    def sums(self, vectors):
-        """One vector whose lane i is the sum over the lanes of vectors[i]; eight vectors."""
-        b = self.builder
-        for width in (4, 2, 1):
-            paired = []
-            for x, y in zip(vectors[: len(vectors) // 2], vectors[len(vectors) // 2 :]):
-                # Blocks of `width` lanes: even blocks of x and y into one vector, odd blocks into the other.
-                even, odd = [], []
-                for block in range(0, LANES, 2 * width):
-                    even += list(range(block, block + width)) + list(range(LANES + block, LANES + block + width))
-                    odd += [i + width for i in even[-2 * width :]]
-                kind = ir.VectorType(ir.IntType(32), LANES)
-                low = b.shuffle_vector(x, y, ir.Constant(kind, even))
-                high = b.shuffle_vector(x, y, ir.Constant(kind, odd))
-                paired.append(self.add(low, high))
-            vectors = paired
-        return vectors[0]
-
-
-def _lane_order():
-    """Which of its eight inputs each lane of `_Lanes.sums` ends up with."""
-    lanes = [[i] * LANES for i in range(LANES)]
-    for width in (4, 2, 1):
-        paired = []
-        for x, y in zip(lanes[: len(lanes) // 2], lanes[len(lanes) // 2 :]):
-            low = []
-            for block in range(0, LANES, 2 * width):
-                low += x[block : block + width] + y[block : block + width]
-            paired.append(low)
-        lanes = paired
-    return lanes[0]
 
 
 class _Walk:
     """The part that forward and backward share: strips and rows of one primitive, and alpha of 8 pixels."""
 
     def __init__(self, builder, group, scalars):
-        self.lanes = _Lanes(builder)
+        self.lanes = Lanes(builder)
         self.builder = builder
         self.group = group
         (self.base, self.r0, self.r1, self.u, self.v, self.hx, self.a, self.b, self.c, self.o, self.smax) = scalars
@@ -265,8 +188,8 @@ def _unblend(typingctx, buf, r0, r1, u, v, hx, a, b, c, o, smax, cr, cg, cb, cz,
         totals = walk.strips((7, 10, fold), body)
         start = builder.mul(args[16], _i64(12))
         out = _float_pointer(context, builder, signature.args[15], args[15], start)
-        order = _lane_order()
-        ln.store(ln.sums([totals[i] for i in _inverse(order)]), out, 0)
+        order = lane_order()
+        ln.store(ln.sums([totals[i] for i in arranged(order)]), out, 0)
         rest = ln.sums([totals[8], totals[9], *[zero] * 6])
         for column, lane in ((8, order.index(0)), (9, order.index(1))):
             value = builder.extract_element(rest, ir.Constant(ir.IntType(32), lane))
@@ -274,14 +197,6 @@ def _unblend(typingctx, buf, r0, r1, u, v, hx, a, b, c, o, smax, cr, cg, cb, cz,
         return context.get_dummy_value()
 
     return types.void(buf, *scalars, sums, types.int64), codegen
-
-
-def _inverse(order):
-    """Arrangement of the inputs of `_Lanes.sums` so that lane i holds the sum of input i."""
-    arranged = [0] * LANES
-    for lane, source in enumerate(order):
-        arranged[source] = lane
-    return arranged
 
 
 @intrinsic
