@@ -1,1 +1,1 @@
-
+"""Scenes, renderers, sensor noise. Ground truth lives here and nowhere else."""

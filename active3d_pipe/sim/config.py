@@ -43,8 +43,12 @@ class CameraSettings(Settings):
 class SensorSettings(Settings):
     """How the scene is rendered and what the depth sensor does to the true depth."""
 
-    backend: Literal["raycast", "pyrender"] = Field("raycast", description="renderer: raycast (Open3D) or pyrender (EGL)")
-    edge_samples: int = Field(8, ge=0, le=64, description="colour samples of a pixel that holds an edge; 0 = no supersampling")
+    backend: Literal["raycast", "pyrender"] = Field(
+        "raycast", description="renderer: raycast (Open3D) or pyrender (EGL)"
+    )
+    edge_samples: int = Field(
+        8, ge=0, le=64, description="colour samples of a pixel that holds an edge; 0 = no supersampling"
+    )
     depth_noise_base_m: float = Field(0.0, ge=0, description="constant part of the depth noise's standard deviation, m")
     depth_noise_per_m2: float = Field(
         0.0, ge=0, description="standard deviation grows by this times depth squared, 1/m (0.002 is a consumer sensor)"

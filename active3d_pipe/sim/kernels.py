@@ -3,6 +3,7 @@
 Every output element is written by one iteration of a parallel loop and depends on inputs alone, so the same input
 gives the same bytes. Layouts of the packed scene are documented at `shading.PackedScene`.
 """
+# mypy: ignore-errors
 
 import math
 
@@ -54,9 +55,9 @@ def _bilinear(texels, offset, width, height, u, v):
 def filtered_texture(texels, levels, first, last, u, v, ux, vx, uy, vy, bias, max_probes):
     """RGB (0..255) of a texture averaged over a pixel's footprint.
 
-    `levels` (L, 3) int64: offset into `texels`, width, height; rows first..last - 1 are this texture's. (ux, vx), (uy, vy): change of (u, v) over one pixel to
-    the right and downwards. Trilinear mip lookups at probes along the footprint's long axis; the level fits its short
-    axis (Heckbert's footprint; "Feline"-style probes).
+    `levels` (L, 3) int64: offset into `texels`, width, height; rows first..last - 1 are this texture's. (ux, vx),
+    (uy, vy): change of (u, v) over one pixel to the right and downwards. Trilinear mip lookups at probes along the
+    footprint's long axis; the level fits its short axis (Heckbert 1989, McCormack et al. 1999).
     """
     width, height = np.float32(levels[first, 1]), np.float32(levels[first, 2])
     ax, ay = ux * width, vx * height
@@ -134,7 +135,8 @@ def _brightness(px, py, pz, nx, ny, nz, lights, occlusion, grid, origin, inv_vox
 
 @njit(fastmath=True, cache=True)
 def _shade_range(begin, end, rays, t, face, bary, right, down, bias, max_probes, rgb, normal,
-                 vertices, faces, face_material, uv, corner_normal, vertex_colors, base_color, mip_range, levels, texels, lights, occlusion, grid, origin, inv_voxel):
+                 vertices, faces, face_material, uv, corner_normal, vertex_colors, base_color, mip_range, levels,
+                 texels, lights, occlusion, grid, origin, inv_voxel):
     for n in range(begin, end):
         f = face[n]
         if f == NO_HIT:
@@ -206,7 +208,8 @@ def _shade_range(begin, end, rays, t, face, bary, right, down, bias, max_probes,
 
 @njit(parallel=True, fastmath=True, cache=True)
 def shade(rays, t, face, bary, right, down, bias, max_probes, rgb, normal,
-          vertices, faces, face_material, uv, corner_normal, vertex_colors, base_color, mip_range, levels, texels, lights, occlusion, grid, origin, inv_voxel):
+          vertices, faces, face_material, uv, corner_normal, vertex_colors, base_color, mip_range, levels,
+          texels, lights, occlusion, grid, origin, inv_voxel):
     """Colours (N, 3) float32 0..255 and viewer-facing unit normals (N, 3) of ray hits.
 
     `rays` (N, 6), `t` (N,), `face` (N,) uint32, `bary` (N, 2) as `SurfaceIndex.cast` returns them; `right`, `down` (3,)
@@ -366,7 +369,8 @@ def crease_normals(faces, starts, corners, merged, face_normal, face_area, cos_c
         for c in range(3):
             v = merged[f, c]
             begin, end = starts[v], starts[v + 1]
-            x, y, z = face_normal[f, 0] * face_area[f], face_normal[f, 1] * face_area[f], face_normal[f, 2] * face_area[f]
+            x, y, z = face_normal[f, 0], face_normal[f, 1], face_normal[f, 2]
+            x, y, z = x * face_area[f], y * face_area[f], z * face_area[f]
             if end - begin <= 256:
                 for k in range(begin, end):
                     g = corners[k] // 3

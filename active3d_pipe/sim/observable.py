@@ -1,10 +1,10 @@
-"""What could be seen and from where, by the ground truth: reachable space, observable surface, held-out views.
+"""What an agent could reach and see at best: the yardstick that evaluation holds a run against.
 
-Only the evaluation asks: a planner that did would be cheating.
+Ground truth: only evaluation and `scene check` may use it.
 """
 
-import math
-import zlib
+import hashlib
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
@@ -12,102 +12,165 @@ from scipy.spatial import cKDTree
 
 from active3d_pipe.errors import InputError
 from active3d_pipe.geometry import se3
-from active3d_pipe.geometry.raycasting import SurfaceIndex
 from active3d_pipe.sim.simulator import Simulator
 from active3d_pipe.structures import VoxelGrid
 
-GRID_M = 0.1  # spacing of the flood fill
-AGENT_RADIUS_M = 0.2
-SPACING_M = 0.4  # spacing of the viewpoints that decide on observability
-NEAREST_VIEWS, RANDOM_VIEWS = 40, 24  # viewpoints tried for every surface point
-TOLERANCE_M = 0.003  # a surface this close in front of a point does not hide it
-PITCH_DEG = (-40.0, 25.0)  # of held-out views, upwards positive
-MAX_BAD_PIXELS = 0.1  # share of pixels without a return, or too near, at which a held-out view is rejected
-TOO_NEAR_M = 0.3
+_MAX_CELLS = 4_000_000
+_VIEWPOINT_SPACING_M = 0.3
+_NEAREST_VIEWPOINTS, _RANDOM_VIEWPOINTS = 32, 96
+_SURFACE_TOLERANCE_M = 0.01
+_MAX_INVALID = 0.10
 
 
-def reachable_positions(simulator: Simulator, radius_m: float = AGENT_RADIUS_M) -> np.ndarray:
-    """(N, 3) float64 centres of the grid cells that a sphere of `radius_m` can reach from the start pose, world m.
+@dataclass(frozen=True, slots=True, eq=False)
+class FreeSpace:
+    """The free space that a sphere can reach from the start without touching a surface.
 
-    Cells are joined over faces. Raises InputError when the start pose itself is too near a surface for any cell
-    around it.
+    Attributes:
+        grid: voxels over the scene's bounds.
+        reachable: (X, Y, Z) bool, whether the sphere's centre can get to the voxel's centre.
+        radius_m: the sphere's radius.
+        clearance: (X, Y, Z) float32 distance of voxel centres to the nearest surface, m.
     """
-    scene = simulator.scene
-    grid = VoxelGrid.from_bounds(scene.bounds_low, scene.bounds_high, GRID_M)
-    clear = simulator.clearance(grid.centres().reshape(-1, 3)).reshape(grid.shape) >= radius_m
-    label, _ = ndimage.label(clear)
+
+    grid: VoxelGrid
+    reachable: np.ndarray
+    radius_m: float
+    clearance: np.ndarray
+
+    @property
+    def volume_m3(self) -> float:
+        """Volume of the reachable voxels."""
+        return float(self.reachable.sum()) * self.grid.voxel_size**3
+
+    @property
+    def floor_area_m2(self) -> float:
+        """Area of the reachable voxels seen from above."""
+        return float(self.reachable.any(axis=2).sum()) * self.grid.voxel_size**2
+
+
+def reachable_space(sim: Simulator, radius_m: float = 0.2, voxel_m: float = 0.1) -> FreeSpace:
+    """Flood fill of free space from the start pose through faces of voxels whose centres are `radius_m` clear.
+
+    The voxel is `voxel_m`, or more where the scene would need over four million. Raises InputError when the start
+    itself is not clear.
+    """
+    scene = sim.scene
+    voxel_m = max(voxel_m, float(np.cbrt(np.prod(scene.bounds_high - scene.bounds_low) / _MAX_CELLS)))
+    grid = VoxelGrid.from_bounds(scene.bounds_low, scene.bounds_high, voxel_m)
+    clearance = sim.clearance(grid.centres().reshape(-1, 3)).reshape(grid.shape)
+    free = clearance > radius_m
+    labels, _ = ndimage.label(free)
     start = scene.start_pose[:3, 3]
-    ijk = np.argwhere(clear)
-    if len(ijk) == 0:
-        raise InputError(f"scene {scene.name}: no place is {radius_m} m away from all surfaces; is the unit right?")
-    nearest = ijk[np.argmin(np.linalg.norm(grid.centre_of(ijk) - start, axis=1))]
-    return grid.centre_of(np.argwhere(label == label[tuple(nearest)]))
-
-
-def observable_points(simulator: Simulator, points: np.ndarray, radius_m: float = AGENT_RADIUS_M) -> np.ndarray:
-    """(N,) bool, which surface points (N, 3) some reachable position can see within the camera's range.
-
-    Every point is tried against its nearest viewpoints, then against random ones; directions do not matter, since
-    the camera can turn.
-    """
-    places = _thinned(reachable_positions(simulator, radius_m), SPACING_M)
-    index = SurfaceIndex(simulator.scene.vertices, simulator.scene.faces)
-    points = np.asarray(points, dtype=np.float32)
-    seen = np.zeros(len(points), bool)
-    count = min(NEAREST_VIEWS, len(places))
-    near = cKDTree(places).query(points, k=count)[1].reshape(len(points), count)
-    rng = np.random.default_rng(zlib.crc32(simulator.scene.name.encode()))
-    far = rng.integers(len(places), size=(len(points), RANDOM_VIEWS))
-    for column in np.concatenate([near, far], axis=1).T:
-        todo = np.flatnonzero(~seen)
-        if len(todo) == 0:
-            break
-        eyes = places[column[todo]].astype(np.float32)
-        in_range = np.linalg.norm(points[todo] - eyes, axis=1) <= simulator.camera.far
-        seen[todo] = in_range & ~index.occluded(eyes, points[todo], TOLERANCE_M)
-    return seen
+    # The start need not fall on a free voxel centre: take the nearest free voxel in a clear line from it.
+    near = np.argwhere(free & (np.linalg.norm(grid.centres() - start, axis=-1) < max(0.5, 3 * voxel_m)))
+    if len(near) == 0:
+        raise InputError(
+            f"scene {scene.name}: no free space for a sphere of {radius_m} m around the start "
+            f"{np.round(start, 2).tolist()}; give another scene.start_position"
+        )
+    centres = grid.centre_of(near)
+    order = np.argsort(np.linalg.norm(centres - start, axis=1), kind="stable")
+    clear = ~sim.surface.occluded(np.broadcast_to(start, centres.shape), centres)[order]
+    first = near[order[int(np.argmax(clear))]]
+    return FreeSpace(grid, labels == labels[tuple(first)], radius_m, clearance)
 
 
 def free_positions(
-    simulator: Simulator, count: int, min_clearance_m: float, rng: np.random.Generator
+    sim: Simulator, n: int, min_clearance_m: float, rng: np.random.Generator, space: FreeSpace | None = None
 ) -> np.ndarray:
-    """(count, 3) positions drawn uniformly from reachable space at least `min_clearance_m` away from surfaces."""
-    cells = reachable_positions(simulator, max(min_clearance_m, AGENT_RADIUS_M))
+    """(n, 3) float64 positions uniform in reachable free space, at least `min_clearance_m` from every surface.
+
+    Raises InputError when the reachable space has no such place.
+    """
+    space = reachable_space(sim) if space is None else space
+    margin = space.grid.voxel_size * np.sqrt(3) / 2
+    cells = np.argwhere(space.reachable & (space.clearance > min_clearance_m - margin))
     found: list[np.ndarray] = []
-    for _ in range(1000):
-        drawn = cells[rng.integers(len(cells), size=count)] + rng.uniform(-0.5, 0.5, (count, 3)) * GRID_M
-        found += list(drawn[simulator.clearance(drawn.astype(np.float32)) >= min_clearance_m])
-        if len(found) >= count:
-            return np.array(found[:count])
-    raise InputError(f"scene {simulator.scene.name}: too little space {min_clearance_m} m away from surfaces")
+    count = 0
+    for _ in range(200):
+        if count >= n or len(cells) == 0:
+            break
+        picked = cells[rng.integers(len(cells), size=max(2 * n, 64))]
+        points = space.grid.centre_of(picked) + (rng.random((len(picked), 3)) - 0.5) * space.grid.voxel_size
+        points = points[sim.clearance(points) >= min_clearance_m]
+        found.append(points)
+        count += len(points)
+    if count < n:
+        raise InputError(f"scene {sim.scene.name}: found no {n} reachable positions {min_clearance_m} m from surfaces")
+    return np.concatenate(found)[:n] if n else np.zeros((0, 3))
 
 
 def held_out_poses(
-    simulator: Simulator, count: int, seed_text: str, *, min_clearance_m: float = 0.3
+    sim: Simulator, n: int, seed_text: str, min_clearance_m: float = 0.3, space: FreeSpace | None = None
 ) -> np.ndarray:
-    """(count, 4, 4) T_world_camera: uniform free positions, any yaw, pitch uniform in PITCH_DEG.
+    """(n, 4, 4) float64 poses of held-out views: positions uniform in reachable space, directions on the sphere.
 
-    Views with more than a tenth of their pixels empty or nearer than 0.3 m are drawn anew. Seeded by `seed_text`
-    (the scene's name): every run and every method is judged on the same views.
+    The camera's x axis stays level. Views with more than 10 % of pixels without depth are drawn again. The same
+    `seed_text` (by custom the scene's name) and scene give the same poses.
     """
-    if count == 0:
-        return np.zeros((0, 4, 4))
-    rng = np.random.default_rng([zlib.crc32(seed_text.encode()), 1])
+    words = np.frombuffer(hashlib.sha256(seed_text.encode()).digest(), dtype=np.uint32)
+    rng = np.random.default_rng(np.random.SeedSequence(words.tolist()))
+    space = reachable_space(sim) if space is None else space
     poses: list[np.ndarray] = []
-    for _ in range(200):
-        for position in free_positions(simulator, count, min_clearance_m, rng):
-            pitch = math.radians(rng.uniform(*PITCH_DEG))
-            T = se3.pose_from_yaw_pitch(position, rng.uniform(-math.pi, math.pi), pitch)
-            depth = simulator.depth(T)
-            if np.mean((depth <= 0) | (depth < TOO_NEAR_M)) <= MAX_BAD_PIXELS:
-                poses.append(T)
-            if len(poses) == count:
-                return np.array(poses)
-    raise InputError(f"scene {simulator.scene.name}: found only {len(poses)} of {count} held-out views")
+    for _ in range(20):
+        positions = free_positions(sim, max(n, 1), min_clearance_m, rng, space)
+        yaw = rng.uniform(-np.pi, np.pi, len(positions))
+        pitch = np.arcsin(rng.uniform(-1, 1, len(positions)))
+        for position, a, b in zip(positions, yaw, pitch):
+            if len(poses) == n:
+                return np.stack(poses) if poses else np.zeros((0, 4, 4))
+            pose = se3.pose_from_yaw_pitch(position, float(a), float(b))
+            if (sim.depth(pose) <= 0).mean() <= _MAX_INVALID:
+                poses.append(pose)
+        if len(poses) == n:
+            return np.stack(poses)
+    raise InputError(
+        f"scene {sim.scene.name}: only {len(poses)} of {n} held-out views see surfaces in 90 % of their pixels; "
+        "the scene is open or larger than camera.far"
+    )
 
 
-def _thinned(points: np.ndarray, spacing: float) -> np.ndarray:
-    """One point for every occupied cell of edge `spacing`."""
-    cells = np.floor(points / spacing).astype(np.int64)
-    _, first = np.unique(cells, axis=0, return_index=True)
-    return points[np.sort(first)]
+def viewpoints(space: FreeSpace, rng: np.random.Generator, spacing_m: float = _VIEWPOINT_SPACING_M) -> np.ndarray:
+    """(M, 3) float64 a thinned set of reachable positions: a random one of every block of `spacing_m`."""
+    cells = np.argwhere(space.reachable)
+    block = cells // max(round(spacing_m / space.grid.voxel_size), 1)
+    order = rng.permutation(len(cells))
+    _, first = np.unique(block[order], axis=0, return_index=True)
+    return space.grid.centre_of(cells[order[first]])
+
+
+def observable_points(
+    sim: Simulator, points: np.ndarray, rng: np.random.Generator, *, radius_m: float = 0.2,
+    max_range_m: float | None = None, space: FreeSpace | None = None,
+) -> np.ndarray:
+    """(N,) bool, which surface points (N, 3) some reachable pose can see.
+
+    A point counts as seen when a straight line of at most `max_range_m` (default: the camera's far limit) from a
+    reachable position meets no surface before its last centimetre. Each point is tried from the nearest viewpoints and
+    then from random ones; `rng` draws both.
+    """
+    points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    space = reachable_space(sim, radius_m) if space is None else space
+    reach = sim.camera.far if max_range_m is None else max_range_m
+    positions = viewpoints(space, rng)
+    seen = np.zeros(len(points), bool)
+    if len(points) == 0 or len(positions) == 0:
+        return seen
+    nearest = min(_NEAREST_VIEWPOINTS, len(positions))
+    distance, index = cKDTree(positions).query(points, k=nearest)
+    distance, index = distance.reshape(len(points), -1), index.reshape(len(points), -1)
+    for k in range(nearest + _RANDOM_VIEWPOINTS):
+        todo = np.flatnonzero(~seen)
+        if len(todo) == 0:
+            break
+        if k < nearest:
+            chosen = index[todo, k]
+        else:
+            chosen = rng.integers(len(positions), size=len(todo))
+        start, end = positions[chosen], points[todo]
+        near = np.linalg.norm(end - start, axis=1) <= reach
+        todo, start, end = todo[near], start[near], end[near]
+        if len(todo):
+            seen[todo] = ~sim.surface.occluded(start, end, _SURFACE_TOLERANCE_M)
+    return seen

@@ -41,9 +41,10 @@ def face_areas(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.
 def find_up_axis(vertices: np.ndarray, faces: np.ndarray, prior: str) -> str:
     """The axis of the file that points up.
 
-    Three clues: rooms are wider than high; floors, ceilings and table tops make the faces across the vertical outweigh
-    those across a horizontal axis, in particular at the two ends of the extent; and furniture stands on the floor, so
-    the area between floor and ceiling has its centre below the middle. `prior` (the format's habit) decides close calls.
+    Three clues: rooms are wider than high; floors, ceilings and table tops make the faces across the vertical
+    outweigh those across a horizontal axis, in particular at the two ends of the extent; and furniture stands on the
+    floor, so the area between floor and ceiling has its centre below the middle. `prior` (the format's
+    habit) decides close calls.
     """
     area, normal, centroid = face_areas(vertices, faces)
     low, high = weighted_range(centroid, area, 0.001)
@@ -86,8 +87,8 @@ def check_extent(vertices: np.ndarray, where: str) -> None:
     if extent.max() < _INDOOR_LENGTH_M[0] or extent.min() <= 0.1 or extent.max() > 4 * _INDOOR_LENGTH_M[1]:
         size = " x ".join(f"{e:.3g}" for e in extent)
         raise InputError(
-            f"{where}: {size} m is no indoor scene (expected {_INDOOR_LENGTH_M[0]} to {4 * _INDOOR_LENGTH_M[1]:.0f} m); "
-            "check scene.unit_scale"
+            f"{where}: {size} m is no indoor scene (expected {_INDOOR_LENGTH_M[0]} to "
+            f"{4 * _INDOOR_LENGTH_M[1]:.0f} m); check scene.unit_scale"
         )
 
 
@@ -96,10 +97,11 @@ def weighted_range(points: np.ndarray, weights: np.ndarray, tail: float) -> tupl
     low, high = np.zeros(3), np.zeros(3)
     for axis in range(3):
         order = np.argsort(points[:, axis], kind="stable")
+        values = points[order, axis]
         share = np.cumsum(weights[order])
         share /= share[-1]
-        low[axis] = points[order[np.searchsorted(share, tail)], axis]
-        high[axis] = points[order[min(np.searchsorted(share, 1 - tail), len(order) - 1)], axis]
+        low[axis] = values[int(np.searchsorted(share, tail))]
+        high[axis] = values[min(int(np.searchsorted(share, 1 - tail)), len(values) - 1)]
     return low, high
 
 
@@ -190,7 +192,7 @@ def find_start_pose(
 
 def _reach(surface: SurfaceIndex, points: np.ndarray, direction_z: float) -> np.ndarray:
     """(N,) distance along +z or -z to the first surface, inf where there is none."""
-    rays = np.concatenate([points, np.broadcast_to(np.float32([0, 0, direction_z]), points.shape)], axis=1)
+    rays = np.concatenate([points, np.broadcast_to(np.array([0, 0, direction_z], np.float32), points.shape)], axis=1)
     return surface.cast(rays)[0]
 
 

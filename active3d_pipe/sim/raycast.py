@@ -27,6 +27,25 @@ class RaycastSimulator(SurfaceRenderer):
         offsets = self._offsets[part]
         return self._cast(self._rays(T, pixels, offsets)), len(offsets)
 
+    def top_view(self, cut_z: float, longest_side: int = 900) -> np.ndarray:
+        """(H, W, 3) uint8 picture of the bounds from far above, +y upwards, without what lies over z = `cut_z`."""
+        low, high = self._scene.bounds_low, self._scene.bounds_high
+        extent, centre = high[:2] - low[:2], 0.5 * (low + high)
+        scale = longest_side / float(extent.max())
+        width, height = (max(round(float(e) * scale), 1) for e in extent)
+        distance = 40.0 * float(extent.max())  # so far away that the perspective is nearly parallel
+        camera = Camera(width, height, scale * distance, scale * distance, width / 2, height / 2, 0.0, 2 * distance)
+        T = np.diag([1.0, -1.0, -1.0, 1.0])
+        T[:3, 3] = [centre[0], centre[1], cut_z + distance]
+        offsets = low_discrepancy_offsets(5)
+        rays = self._rays(T, np.arange(width * height), offsets, camera)
+        below = rays.copy()
+        below[:, :3] += np.float32(distance) * below[:, 3:]
+        hits = self._cast(below)
+        hits.rays, hits.t = rays, hits.t + np.float32(distance)
+        rgb, _ = self._shade(T, hits, 1 / np.sqrt(len(offsets)), camera=camera)
+        return np.rint(rgb.reshape(height, width, len(offsets), 3).mean(axis=2)).astype(np.uint8)
+
     def _cast(self, rays: np.ndarray) -> Hits:
         """First hits of rays that is not a hole."""
         hits = Hits(rays, *self.surface.cast(rays))

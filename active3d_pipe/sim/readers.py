@@ -1,12 +1,9 @@
 """Scene files to triangle soups: GLB, glTF, OBJ and PLY by one path (trimesh)."""
 
-import hashlib
-import json
 import logging
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-from urllib.parse import unquote
+from typing import Any, cast
 
 import numpy as np
 
@@ -15,7 +12,6 @@ from active3d_pipe.sim.materials import Material, mip_pyramid
 
 FORMATS = (".glb", ".gltf", ".obj", ".ply")
 _MAX_TEXTURE = 8192
-_FACES_CHUNK = 1 << 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,40 +41,6 @@ def scene_path(file: str) -> Path:
     return path
 
 
-def digest(path: Path) -> str:
-    """sha256 (hex) over the scene file, the files that it names, and `scene.json` beside it."""
-    total = hashlib.sha256()
-    for part in [path, *_referenced(path), path.with_name("scene.json")]:
-        if part.is_file():
-            with part.open("rb") as stream:
-                total.update(hashlib.file_digest(stream, "sha256").digest())
-    return total.hexdigest()
-
-
-def _referenced(path: Path) -> list[Path]:
-    """Buffers, images and material files that a text format refers to, in the order of appearance."""
-    suffix, folder, names = path.suffix.lower(), path.parent, []
-    if suffix == ".gltf":
-        try:
-            document = json.loads(path.read_text(encoding="utf-8"))
-        except (ValueError, OSError):
-            return []  # reading the scene reports the damage
-        items = [*document.get("buffers", []), *document.get("images", [])] if isinstance(document, dict) else []
-        uris = [item.get("uri", "") for item in items if isinstance(item, dict)]
-        names = [unquote(uri) for uri in uris if uri and not uri.startswith("data:")]
-    elif suffix == ".obj":
-        for library in _statements(path, ("mtllib",)):
-            names.append(library)
-            if (folder / library).is_file():
-                names += [line.split()[-1] for line in _statements(folder / library, ("map_Kd", "map_d")) if line]
-    return [folder / name for name in names]
-
-
-def _statements(path: Path, keywords: tuple[str, ...]) -> list[str]:
-    with path.open(encoding="utf-8", errors="replace") as stream:
-        return [line.split(None, 1)[1].strip() for line in stream if line.startswith(keywords) and len(line.split()) > 1]
-
-
 def read_soup(path: Path) -> Soup:
     """Read every mesh of a scene file, node transforms applied, textures decoded.
 
@@ -92,11 +54,14 @@ def read_soup(path: Path) -> Soup:
         loaded = trimesh.load_scene(str(path), process=False)
         nodes = [(node, *loaded.graph[node]) for node in loaded.graph.nodes_geometry]
     except Exception as error:  # the reader raises whatever its parsers meet: struct, JSON, index, type errors
-        reason = str(error).splitlines()[0] if str(error) else "no reason given"
-        raise InputError(f"scene {path}: cannot be read as {path.suffix[1:]} ({type(error).__name__}: {reason})") from error
-    parts, materials, warnings, known = [], [], [], {}
-    for _, transform, geometry_name in sorted(nodes, key=lambda item: item[0]):
-        mesh = loaded.geometry[geometry_name]
+        reason = f"{type(error).__name__}: {(str(error).splitlines() or ['no reason given'])[0]}"
+        raise InputError(f"scene {path}: cannot be read as {path.suffix[1:]} ({reason})") from error
+    parts: list[tuple[Any, ...]] = []
+    materials: list[Material] = []
+    warnings: list[str] = []
+    known: dict[int, int] = {}
+    for _, transform, geometry in sorted(nodes, key=lambda item: item[0]):
+        geometry_name, mesh = str(geometry), cast(Any, loaded.geometry[geometry])
         if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
             warnings.append(f"{geometry_name}: no faces, ignored")
             continue
@@ -110,7 +75,7 @@ def read_soup(path: Path) -> Soup:
     return _join(parts, tuple(materials), tuple(warnings), path)
 
 
-def _part(mesh: Any, transform: np.ndarray, material: int, textured: bool) -> tuple[np.ndarray, ...]:
+def _part(mesh: Any, transform: np.ndarray, material: int, textured: bool) -> tuple[Any, ...]:
     """(vertices, faces, material ids, uv or None, colours or None) of one mesh in file coordinates."""
     vertices = np.asarray(mesh.vertices, dtype=np.float64) @ transform[:3, :3].T + transform[:3, 3]
     faces = np.asarray(mesh.faces, dtype=np.int64)

@@ -11,16 +11,16 @@ from active3d_pipe.sim.config import SensorSettings
 from active3d_pipe.sim.scene import Scene
 from active3d_pipe.structures import Camera, Frame, check_pose
 
-# Colour steps, 0..255. Below the first an edge is not worth more samples (an edge of step s that is not resolved costs a
-# variance of s^2 / 12 in its pixel); from the second on any change of face counts as an edge, for pictures that share a
-# material with what surrounds them; a pixel whose first samples differ by more than the third gets the others too.
+# Colour steps, 0..255. Below the first an edge is not worth more samples (an unresolved edge of step s costs a variance
+# of s^2 / 12 in its pixel); from the second on any change of face counts as an edge, for pictures that share a material
+# with what surrounds them; a pixel whose first samples differ by more than the third gets the others too.
 _CONTRAST, _TEXTURE_CONTRAST, _SPREAD = 6.0, 32.0, 12.0
 _CLEARANCE_STEP_M = 0.005
 
 
 @dataclass(slots=True, eq=False)
 class Hits:
-    """First surfaces along N rays: `rays` (N, 6), `t` (N,), `face` (N,) uint32, `bary` (N, 2), see SurfaceIndex.cast."""
+    """First surfaces along N rays: `rays` (N, 6), `t` (N,), `face` (N,), `bary` (N, 2), see SurfaceIndex.cast."""
 
     rays: np.ndarray
     t: np.ndarray
@@ -39,8 +39,8 @@ class SurfaceRenderer(ABC):
 
     def __init__(self, scene: Scene, camera: Camera, settings: SensorSettings, seed: int = 0) -> None:
         self._scene, self._camera, self._settings, self._seed = scene, camera, settings, seed
-        self.surface = SurfaceIndex(scene.vertices, scene.faces)
-        self._packed = shading.pack(scene, self.surface)
+        self._surface = SurfaceIndex(scene.vertices, scene.faces)
+        self._packed = shading.pack(scene, self._surface)
         self._centres = np.full((1, 2), 0.5)
         self._all_pixels = np.arange(camera.width * camera.height)
 
@@ -53,6 +53,11 @@ class SurfaceRenderer(ABC):
     def camera(self) -> Camera:
         """Intrinsics of every frame."""
         return self._camera
+
+    @property
+    def surface(self) -> SurfaceIndex:
+        """Ray and distance queries on the true surface."""
+        return self._surface
 
     @property
     def seed(self) -> int:
@@ -128,10 +133,14 @@ class SurfaceRenderer(ABC):
             rgb[pixels] = total / count[:, None]
         return rgb
 
-    def _shade(self, T: np.ndarray, hits: Hits, footprint: float, probes: int = shading.MAX_PROBES) -> tuple[np.ndarray, np.ndarray]:
+    def _shade(
+        self, T: np.ndarray, hits: Hits, footprint: float, probes: int = shading.MAX_PROBES,
+        camera: Camera | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Colours and normals (N, 3) float32 of hits whose samples are `footprint` pixels wide."""
-        right = (T[:3, 0] * (footprint / self._camera.fx)).astype(np.float32)
-        down = (T[:3, 1] * (footprint / self._camera.fy)).astype(np.float32)
+        camera = self._camera if camera is None else camera
+        right = (T[:3, 0] * (footprint / camera.fx)).astype(np.float32)
+        down = (T[:3, 1] * (footprint / camera.fy)).astype(np.float32)
         rgb = np.empty((len(hits.t), 3), np.float32)
         normal = np.empty((len(hits.t), 3), np.float32)
         kernels.shade(
@@ -140,12 +149,15 @@ class SurfaceRenderer(ABC):
         )
         return rgb, normal
 
-    def _rays(self, T: np.ndarray, pixels: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+    def _rays(
+        self, T: np.ndarray, pixels: np.ndarray, offsets: np.ndarray, camera: Camera | None = None
+    ) -> np.ndarray:
         """(P * K, 6) float32 rays through points `offsets` (K, 2) of `pixels` (P,)."""
-        camera = self._camera
+        camera = self._camera if camera is None else camera
         rays = np.empty((len(pixels) * len(offsets), 6), np.float32)
         kernels.sample_rays(
-            pixels, offsets, camera.width, np.ascontiguousarray(T), 1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy, rays
+            pixels, offsets, camera.width, np.ascontiguousarray(T), 1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy,
+            rays,
         )
         return rays
 

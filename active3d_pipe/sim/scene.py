@@ -1,7 +1,8 @@
 """A scene: triangles with materials in the world frame (metres, Z up), where it ends and where the agent starts."""
 
 import json
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from active3d_pipe.errors import InputError
 from active3d_pipe.geometry.raycasting import SurfaceIndex
 from active3d_pipe.sim import placement, readers
 from active3d_pipe.sim.config import SceneSettings
+from active3d_pipe.sim.digest import source_digest
 from active3d_pipe.sim.materials import Material
 from active3d_pipe.structures import check_pose
 
@@ -58,12 +60,6 @@ class Scene:
             raise InputError(f"scene {self.name}: bounds {self.bounds_low} .. {self.bounds_high}, expected low < high")
 
 
-def scene_digest(settings: SceneSettings) -> str:
-    """sha256 (hex) of the scene file, the files it refers to, and the `scene.json` beside it; the mesh is not read."""
-    path = readers.scene_path(settings.file)
-    return readers.digest(path)
-
-
 def load_scene(settings: SceneSettings) -> Scene:
     """Read a scene file and find, or take from `settings`, its up axis, unit, bounds and start pose.
 
@@ -78,7 +74,7 @@ def load_scene(settings: SceneSettings) -> Scene:
     sidecar = _read_sidecar(path)
     where = f"scene {path}"
 
-    up_axis = settings.up_axis
+    up_axis: str = settings.up_axis
     if up_axis == "auto":
         up_axis = _sidecar_axis(sidecar, path) or placement.find_up_axis(
             soup.vertices, soup.faces, prior="Z" if path.suffix.lower() == ".ply" else "Y"
@@ -99,7 +95,7 @@ def load_scene(settings: SceneSettings) -> Scene:
     return Scene(
         name=scene_name(path), vertices=vertices, faces=soup.faces, face_material=soup.face_material, uv=soup.uv,
         vertex_colors=soup.vertex_colors, materials=soup.materials, bounds_low=low, bounds_high=high, start_pose=start,
-        floor_z=floor_z, source_digest=readers.digest(path), up_axis=up_axis, unit_scale=float(scale),
+        floor_z=floor_z, source_digest=source_digest(str(path)), up_axis=up_axis, unit_scale=float(scale),
         warnings=(*soup.warnings, *notes),
     )
 
@@ -110,23 +106,20 @@ def scene_name(path: Path) -> str:
     return path.resolve().parent.name if stem in ("scene", "mesh", "mesh_semantic") else stem
 
 
-def with_start(scene: Scene, start_pose: np.ndarray) -> Scene:
-    """The same scene with another start pose."""
-    return replace(scene, start_pose=np.asarray(start_pose, dtype=np.float64))
-
-
 def _start_pose(
     settings: SceneSettings, sidecar: dict[str, Any], surface: SurfaceIndex, low: np.ndarray, high: np.ndarray,
     floor_z: float, where: str,
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    position, target = settings.start_position, settings.start_look_at
+    position: Sequence[float] | None = settings.start_position
+    target: Sequence[float] | None = settings.start_look_at
     given = sidecar.get("start_pose")
     if position is None and given is not None:
         try:
-            position = tuple(float(x) for x in given["position"])
-            target = target or tuple(float(x) for x in given["look_at"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"{where}: start_pose in scene.json needs position and look_at of 3 numbers each") from error
+            position = [float(given["position"][i]) for i in range(3)]
+            target = target or [float(given["look_at"][i]) for i in range(3)]
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            expected = "position and look_at of 3 numbers each"
+            raise InputError(f"{where}: start_pose in scene.json needs {expected}") from error
     if position is None:
         return placement.find_start_pose(surface, low, high, floor_z, where, look_at=target)
     return placement.given_start_pose(surface, low, high, position, target, where), ()
@@ -150,7 +143,7 @@ def _read_sidecar(path: Path) -> dict[str, Any]:
 def _sidecar_axis(sidecar: dict[str, Any], path: Path) -> str | None:
     axis = sidecar.get("up_axis")
     if axis is not None and axis not in placement.UP_AXES:
-        raise InputError(f"{path.with_name('scene.json')}: up_axis is {axis!r}, expected one of {list(placement.UP_AXES)}")
+        raise InputError(f"scene {path}: up_axis in scene.json is {axis!r}, expected one of {list(placement.UP_AXES)}")
     return axis
 
 
@@ -161,5 +154,5 @@ def _sidecar_scale(sidecar: dict[str, Any], path: Path) -> float | None:
     if isinstance(units, int | float) and units > 0:
         return float(units)
     if units not in placement.UNITS:
-        raise InputError(f"{path.with_name('scene.json')}: units is {units!r}, expected one of {list(placement.UNITS)}")
+        raise InputError(f"scene {path}: units in scene.json is {units!r}, expected one of {list(placement.UNITS)}")
     return placement.UNITS[units]

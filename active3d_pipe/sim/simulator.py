@@ -5,6 +5,7 @@ from typing import Protocol
 import numpy as np
 
 from active3d_pipe.errors import ConfigError
+from active3d_pipe.geometry.raycasting import SurfaceIndex
 from active3d_pipe.sim.config import CameraSettings, SceneSettings, SensorSettings
 from active3d_pipe.sim.scene import Scene, load_scene
 from active3d_pipe.structures import Camera, Frame
@@ -21,6 +22,10 @@ class Simulator(Protocol):
     def camera(self) -> Camera:
         """Intrinsics of every frame."""
 
+    @property
+    def surface(self) -> SurfaceIndex:
+        """Ray and distance queries on the true surface."""
+
     def render(self, T_world_camera: np.ndarray, *, step: int = 0, stamp_ns: int = 0) -> Frame:
         """The frame that the agent's camera takes at a pose: anti-aliased colour, sensor depth at pixel centres.
 
@@ -34,7 +39,7 @@ class Simulator(Protocol):
         """(N,) float32 distance, m, of world points (N, 3) to the true surface."""
 
     def segment_clearance(self, a: np.ndarray, b: np.ndarray) -> float:
-        """Smallest distance, m, between the straight segment a-b (world points) and the true surface; 0 = it crosses."""
+        """Smallest distance, m, from the straight segment a-b (world points) to the true surface; 0 = it crosses."""
 
 
 def make_simulator(
