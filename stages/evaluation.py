@@ -27,11 +27,11 @@ def _parameters(config: Any, inputs: Mapping[NodeId, Path]) -> dict[str, Any]:
 
 def _run(context: StageContext) -> None:
     import numpy as np
-    from active3d_pipe.sim.observable import observable_points
 
     from active3d_pipe.evaluation import evaluate as ev
     from active3d_pipe.evaluation.culling import SeenBy
     from active3d_pipe.evaluation.geometry_metrics import prepare_truth
+    from active3d_pipe.sim.observable import observable_points
     from active3d_pipe.storage import meshes
     from active3d_pipe.storage.files import write_json
     from active3d_pipe.structures import TriangleMesh
@@ -48,12 +48,12 @@ def _run(context: StageContext) -> None:
     truth_mesh = TriangleMesh(scene.vertices.astype(np.float32), scene.faces.astype(np.int32))
 
     def observable(points: np.ndarray) -> np.ndarray:
-        return observable_points(simulator, points)
+        # Seeded by the evaluation, not by the run: every run is judged on the same points.
+        return observable_points(simulator, points, np.random.default_rng(settings.seed))
 
     truth = prepare_truth(truth_mesh, settings, observable)
     context.progress("geometry")
-    culling = frames[:: settings.cull_stride]
-    seen_by = SeenBy(frames[0].camera, np.stack([f.T_world_camera for f in culling]), [f.depth for f in culling])
+    seen_by = SeenBy(frames[0].camera, np.stack([f.T_world_camera for f in frames]), [f.depth for f in frames])
     metrics = ev.evaluate_geometry(mesh, truth, settings, seen_by=seen_by, query_sdf=hybrid.field.query_sdf)
 
     def render(camera: Any, T: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -100,17 +100,15 @@ def _curves(context: StageContext, truth_mesh: "TriangleMesh", observable: Any) 
         if node.stage == "uncertainty" and node.round is not None:
             steps = read_json(context.input("capture", node.round) / shared.CAPTURE_NAME)["steps_total"]
             surface = meshes.read_mesh(folder / shared.SURFACE_NAME)
-            if len(surface.faces):
-                points.append({"round": node.round, **ev.curve_point(steps, surface, truth, settings)})
+            points.append({"round": node.round, **ev.curve_point(steps, surface, truth, settings)})
             context.progress(f"curve at round {node.round}")
     return points
 
 
 def _view_sets(simulator: Any, frames: list, settings: Any) -> dict[str, list]:
     """Held-out views at random free poses, the circle protocol, and a sample of the captured frames."""
-    from active3d_pipe.sim.observable import held_out_poses
-
     from active3d_pipe.evaluation.views import circle_poses
+    from active3d_pipe.sim.observable import held_out_poses
 
     scene = simulator.scene
     held_out = held_out_poses(simulator, settings.num_views, scene.name, min_clearance_m=settings.view_clearance_m)

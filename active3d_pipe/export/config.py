@@ -23,3 +23,13 @@ class MeshSettings(Settings):
     cull_facing_cosine: float = Field(
         0.0, ge=-1, le=1, description="a face is seen only by cameras towards which its normal has at least this cosine"
     )
+
+
+class ExportSettings(Settings):
+    """What is handed over at the end of a run."""
+
+    mesh: MeshSettings = Field(default_factory=MeshSettings, description="the coloured mesh")
+    glb: bool = Field(True, description="write the mesh as GLB beside PLY")
+    preview_voxel_m: float = Field(
+        0.05, gt=0, description="cell edge of the coarse surface written every round (curves, looking at progress), m"
+    )

@@ -17,7 +17,7 @@ from active3d_pipe.gaussians.seeding import error_driven, seed_frame
 from active3d_pipe.mapping.hybrid_map import HybridMap
 from active3d_pipe.structures import Frame
 
-COUPLED = 20_000  # primitives of one coupling step
+COUPLED = 8192  # primitives of one coupling step
 
 
 @dataclass(slots=True)
