@@ -26,9 +26,10 @@ def check(
     from active3d_pipe.pipeline.config import Config, validate
     from active3d_pipe.sim.check import check_scene
 
-    settings = validate(layers, Config).scene
+    config = validate(layers, Config)
+    settings = config.scene
     settings = type(settings).model_validate({**settings.model_dump(), "file": str(resolve(file))})
-    found = check_scene(settings)
+    found = check_scene(settings, config.camera, config.motion.agent_radius_m)
     pictures: list[str] = []
     if out is not None:
         pictures = _write_pictures(out, found.pictures)
