@@ -20,7 +20,7 @@ class UncertaintySettings(Settings):
     # Free and hit evidence from depth rays
     ray_stride: int = Field(4, ge=1, description="every n-th pixel in x and y casts a ray into the grid")
     free_log_odds: float = Field(0.5, gt=0, description="log-odds taken from a voxel by a ray that passed it")
-    hit_log_odds: float = Field(1.0, gt=0, description="log-odds given to a voxel by a ray that ended in it")
+    hit_log_odds: float = Field(2.5, gt=0, description="log-odds given to a voxel by a ray that ended in it")
     free_log_odds_max: float = Field(7.0, gt=0, description="most that passing rays together may take, log-odds")
     hit_log_odds_max: float = Field(9.0, gt=0, description="most that ending rays together may give, log-odds")
     gaussian_log_odds: float = Field(2.0, ge=0, description="log-odds of a voxel full of opaque Gaussians")

@@ -21,7 +21,7 @@ def ray_log_odds(evidence: RayEvidence, settings: UncertaintySettings) -> np.nda
     """Log-odds of occupancy from depth rays; 0 where no ray went.
 
     Hits and passes are clamped apart, hits higher: a thin pole is passed by far more rays than end on it, and stays
-    occupied; a single stray return in space that many rays passed does not.
+    occupied from the third return on; a single stray return in space that many rays passed does not.
     """
     hits = np.minimum(evidence.hit * np.float32(settings.hit_log_odds), np.float32(settings.hit_log_odds_max))
     frees = np.minimum(evidence.free * np.float32(settings.free_log_odds), np.float32(settings.free_log_odds_max))
