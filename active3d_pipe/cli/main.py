@@ -2,6 +2,7 @@
 
 import sys
 import traceback
+import warnings
 from pathlib import Path
 
 import typer
@@ -45,6 +46,8 @@ app.add_typer(configure, name="config")
 
 def main() -> None:
     """Run the command line and exit with its code."""
+    # Numba tells of an old TBB library although it goes on with OpenMP, which is what is wanted.
+    warnings.filterwarnings("ignore", message="The TBB threading layer requires TBB")
     sys.exit(_main(sys.argv[1:]))
 
 
