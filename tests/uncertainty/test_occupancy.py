@@ -63,7 +63,10 @@ def test_more_evidence_never_turns_round(free, hit, more):
 
 @pytest.mark.parametrize(
     ("free", "hit", "low", "high"),
-    [(10, 0, 0, 0.01), (1000, 0, 0, 0.001), (0, 10, 0.99, 1), (5000, 3, 0.5, 1), (5000, 40, 0.8, 1), (5000, 1, 0, 0.02)],
+    [
+        (10, 0, 0, 0.01), (1000, 0, 0, 0.001), (0, 10, 0.99, 1), (5000, 3, 0.5, 1), (5000, 40, 0.8, 1),
+        (5000, 1, 0, 0.02),
+    ],
 )
 def test_what_rays_say(free, hit, low, high):
     """Several passes make free, several hits occupied; a pole among many passes stays; one stray return does not."""
