@@ -17,9 +17,18 @@ class InformationSettings(Settings):
         0.1, ge=0, le=1, description="entropy that a voxel keeps, per branch, after it has been seen, bits"
     )
     settled_rays: float = Field(3.0, gt=0, description="depth rays after which a voxel counts as seen")
-    enough_quality: float = Field(
-        0.35, gt=0, le=1, description="view quality from which a surface is seen well enough: closer looks earn nothing"
+    reference_footprint_m: float = Field(
+        0.005, gt=0, description="width of a pixel on a frontal surface at which a look has quality 1, m (the scale of "
+        "the volume view_quality)"
     )
-    quality_range_m: float = Field(
-        1.0, gt=0, description="distance up to which a frontal look has quality 1; beyond it falls with 1 / distance"
+    enough_distance_m: float = Field(
+        3.0, gt=0, description="a surface seen frontally from here was seen well enough: closer looks earn nothing"
     )
+
+    def quality_range_m(self, focal_px: float) -> float:
+        """Distance up to which a frontal look has quality 1; beyond it quality falls with 1 / distance."""
+        return self.reference_footprint_m * focal_px
+
+    def enough_quality(self, focal_px: float) -> float:
+        """View quality from which nothing is gained by a better look."""
+        return min(1.0, self.quality_range_m(focal_px) / self.enough_distance_m)

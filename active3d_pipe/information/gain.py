@@ -8,7 +8,7 @@ The observation model, in one place:
 - A look at an open voxel settles it: each branch's entropy falls to a residual. The fraction of this that is still
   to be had is its novelty, 1 for a voxel that no ray reached and 0 once `settled_rays` did.
 - A look at a surface voxel improves it as far as the look is better than the best so far (closer, more frontal),
-  up to `enough_quality`; beyond that nothing is gained, so close-ups are not chased.
+  up to what is enough; beyond that nothing is gained, so close-ups are not chased.
 - Seen free space tells nothing, whatever its U and H say.
 """
 
@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from active3d_pipe.information.config import InformationSettings
+from active3d_pipe.structures.camera import Camera
 
 FREE, OPEN, SURFACE = 0, 1, 2
 # A voxel whose rays end in it at least this often is no free space: thin structure fills part of a voxel only.
@@ -55,7 +56,7 @@ class InformationVolumes:
     Attributes:
         kind: uint8, FREE, OPEN or SURFACE.
         value: float32, w(v) (1 - O(v)) times novelty; 0 for surface and seen free space.
-        surface_value: float32, what improving the surface from quality 0 to `enough_quality` is worth.
+        surface_value: float32, what improving the surface from quality 0 to enough is worth.
         quality: float32, best observation so far.
         gain_imp, gain_exp: float32, expected entropy reduction of a look, bits.
     """
@@ -97,20 +98,27 @@ def hybrid_weight(u: np.ndarray, entropy: np.ndarray, settings: InformationSetti
 
 
 def view_quality(
-    cos_incidence: np.ndarray | float, distance_m: np.ndarray | float, settings: InformationSettings
+    cos_incidence: np.ndarray | float, distance_m: np.ndarray | float, quality_range_m: float
 ) -> np.ndarray:
-    """Quality of one look at a surface: |cos| of the incidence angle times min(1, quality_range / distance)."""
-    near = np.minimum(1, settings.quality_range_m / np.maximum(distance_m, 1e-6))
+    """Quality of one look at a surface: |cos| of the incidence angle times min(1, quality_range / distance).
+
+    The range is `InformationSettings.quality_range_m` of the camera.
+    """
+    near = np.minimum(1, quality_range_m / np.maximum(distance_m, 1e-6))
     return np.clip(np.abs(cos_incidence), 0, 1) * near
 
 
 def information_volumes(
-    arrays: Mapping[str, np.ndarray], settings: InformationSettings, credit: np.ndarray | None = None
+    arrays: Mapping[str, np.ndarray],
+    settings: InformationSettings,
+    enough_quality: float,
+    credit: np.ndarray | None = None,
 ) -> InformationVolumes:
     """Gain quantities of every voxel, from the arrays of an `UncertaintyVolume`.
 
     Args:
         arrays: the volumes named in `structures.uncertainty_volume.VOLUMES`, float32 [X, Y, Z].
+        enough_quality: `InformationSettings.enough_quality` of the camera.
         credit: [X, Y, Z] factor in [0, 1] on everything that is expected of a voxel, e.g. lowered where earlier
             looks brought nothing; None = 1.
     """
@@ -120,7 +128,7 @@ def information_volumes(
     weight = hybrid_weight(u, arrays["entropy"], settings)
     novelty = np.where(kind == OPEN, np.maximum(0, 1 - rays / np.float32(settings.settled_rays)), 0)
     # What a better look still brings to a surface, as a fraction of the whole improvement.
-    rest = np.maximum(0, 1 - arrays["view_quality"] / np.float32(settings.enough_quality))
+    rest = np.maximum(0, 1 - arrays["view_quality"] / np.float32(enough_quality))
     rest = np.where(kind == SURFACE, rest, 0)
     trust = np.float32(1) if credit is None else credit.astype(np.float32)
     value = weight * (1 - arrays["occupancy"]) * novelty * trust
@@ -137,17 +145,21 @@ def information_volumes(
 
 
 def visible_information(
-    arrays: Mapping[str, np.ndarray], visible: np.ndarray, settings: InformationSettings | None = None
+    arrays: Mapping[str, np.ndarray],
+    visible: np.ndarray,
+    camera: Camera,
+    settings: InformationSettings | None = None,
 ) -> GainTerms:
-    """Expected gain of a view that sees the voxels `visible` (flat ids, each once).
+    """Expected gain of a view that sees the voxels `visible` of a camera (flat ids, each once).
 
     Surface counts as if it were then seen well enough; a caller that knows the pose scores more finely
     (`planning.reward`).
     """
     settings = settings or InformationSettings()
-    volumes = information_volumes(arrays, settings)
+    enough = settings.enough_quality(camera.fx)
+    volumes = information_volumes(arrays, settings, enough)
     kind = volumes.kind.ravel()[visible]
-    missing = np.maximum(0, 1 - volumes.quality.ravel()[visible] / settings.enough_quality)
+    missing = np.maximum(0, 1 - volumes.quality.ravel()[visible] / enough)
     surface = float((volumes.surface_value.ravel()[visible] * missing).sum(dtype=np.float64))
     return GainTerms(
         reward=float(volumes.value.ravel()[visible].sum(dtype=np.float64)) + surface,

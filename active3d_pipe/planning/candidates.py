@@ -66,12 +66,14 @@ def coarse_positions(space: FreeSpace, settings: PlanningSettings) -> np.ndarray
 
     Blocks have the coarse spacing, or the smallest multiple of it at which there are at most `max_positions`.
     """
-    spacing = settings.coarse_spacing_m
+    spacing, voxel = settings.coarse_spacing_m, space.grid.voxel_size
     ijk = np.argwhere(space.reachable)
     while True:
-        chosen = _thin(ijk, space, spacing)
-        if len(chosen) <= settings.max_positions:
-            return chosen
+        block = max(1, round(spacing / voxel))
+        occupied = np.zeros(np.asarray(space.grid.shape) // block + 1, bool)
+        occupied[tuple((ijk // block).T)] = True
+        if occupied.sum() <= settings.max_positions:
+            return _thin(ijk, space, block * voxel)
         spacing *= 1.2
 
 

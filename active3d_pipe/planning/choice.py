@@ -58,6 +58,15 @@ def view_cost_steps(
     return np.maximum(travel_m / motion.max_step_m, angle / motion.max_turn_deg)
 
 
+def utility_rate(rewards: np.ndarray, steps: np.ndarray, settings: PlanningSettings) -> np.ndarray:
+    """Utility of views: log(1 + R / R_0) per step it takes to get there, fixed cost of a view included.
+
+    The logarithm says that the first part of a large gain is worth most. Without it a doorway with a whole unseen
+    room behind always beats the last corner of this one, which then has to be come back for from far away.
+    """
+    return np.log1p(np.maximum(rewards, 0) / settings.reward_scale) / (steps + settings.view_steps)
+
+
 def positions_world(space: FreeSpace, voxels: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray:
     """(P, 3) world positions of voxels; the agent's own voxel stands for where it is, the ground keeps its height."""
     out = space.grid.centre_of(voxels)
@@ -85,7 +94,7 @@ def score(
         travel = np.repeat(space.cost[tuple(voxels.T)], num_views)
         rotations = np.tile(directions.rotations, (len(voxels), 1, 1))
         steps = view_cost_steps(travel, R, rotations, motion).reshape(rewards.shape)
-        return rewards / (steps + settings.view_steps)
+        return utility_rate(rewards, steps, settings)
 
     # The place where the agent stands is always a candidate: turning is the cheapest motion.
     voxels = np.unique(np.concatenate([space.start[None], coarse_positions(space, settings)]), axis=0)
@@ -114,7 +123,7 @@ def score(
     terms = exact_terms(field, poses, camera)
     travel = space.cost[tuple(goal_voxels.T)].astype(np.float64)
     reward = np.array([t.reward for t in terms])
-    final = reward / (view_cost_steps(travel, R, poses[:, :3, :3], motion) + settings.view_steps)
+    final = utility_rate(reward, view_cost_steps(travel, R, poses[:, :3, :3], motion), settings)
     final = np.where(committed, final * settings.commitment, final)
     order = np.argsort(-final, kind="stable")
     return Pool(

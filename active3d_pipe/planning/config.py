@@ -32,6 +32,9 @@ class PlanningSettings(Settings):
     view_steps: float = Field(
         10.0, gt=0, description="fixed cost of a view in steps, added to travel: larger prefers large gains far away"
     )
+    reward_scale: float = Field(
+        1000.0, gt=0, description="reward from which more of it counts less and less (logarithmically)"
+    )
     commitment: float = Field(
         1.25, ge=1, description="factor on the utility of going on to the goal of the decision before"
     )

@@ -12,7 +12,7 @@ import numpy as np
 from active3d_pipe.errors import InputError
 from active3d_pipe.geometry.voxel_traversal import visible_voxels
 from active3d_pipe.planning.candidates import Directions, view_directions
-from active3d_pipe.planning.choice import Pool, looks_along, reward_density, score, view_cost_steps
+from active3d_pipe.planning.choice import Pool, looks_along, reward_density, score, utility_rate, view_cost_steps
 from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.free_space import FreeSpace, build_free_space
 from active3d_pipe.planning.path import look_around, step_path
@@ -204,7 +204,7 @@ def _chain(
         terms = exact_terms(field, pool.poses[near], task.camera)
         rotations = pool.poses[near][:, :3, :3]
         cost = view_cost_steps(here.cost[tuple(pool.voxels[near].T)], T[:3, :3], rotations, task.motion)
-        best = int((np.array([t.reward for t in terms]) / (cost + settings.view_steps)).argmax())
+        best = int(utility_rate(np.array([t.reward for t in terms]), cost, settings).argmax())
         if terms[best].reward < settings.stop_reward:
             break
         index = near[best]

@@ -15,8 +15,8 @@ def surface_share(field: RewardField, v: int, direction: np.ndarray, distance_m:
     normal = field.normal[v].astype(float)
     norm = np.linalg.norm(normal)
     cos = min(1.0, float(abs(normal @ direction) / norm)) if norm > 1 else 0.7
-    enough = field.information.enough_quality
-    new = float(view_quality(cos, distance_m, field.information))
+    enough = field.enough_quality
+    new = float(view_quality(cos, distance_m, field.quality_range_m))
     return max(0.0, min(new, enough) - float(field.quality[v])) / enough, cos
 
 
@@ -44,7 +44,7 @@ def exact_terms(field: RewardField, T_world_camera: np.ndarray, fan: np.ndarray)
                     distance = grid.voxel_size * float(np.linalg.norm(np.asarray(ijk) + 0.5 - origin))
                     share, _ = surface_share(field, v, direction, distance)
                     surface += transmittance * field.surface_value[v] * share
-                    left = 1 - field.quality[v] / field.information.enough_quality
+                    left = 1 - field.quality[v] / field.enough_quality
                     if left > 0:
                         imp += transmittance * share / left * field.gain_imp[v]
                         exp += transmittance * share / left * field.gain_exp[v]

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from active3d_pipe.geometry.voxel_traversal import fan_stride, ray_fan
-from active3d_pipe.information.config import InformationSettings
 from active3d_pipe.information.gain import FREE, OPEN, SURFACE, GainTerms, InformationVolumes, information_volumes
 from active3d_pipe.planning import kernels_distance
 from active3d_pipe.planning import kernels_reward as kernels
@@ -30,7 +29,8 @@ class RewardField:
     """Everything a view's reward is computed from, flat in C order where kernels read it."""
 
     grid: VoxelGrid
-    information: InformationSettings
+    quality_range_m: float
+    enough_quality: float
     max_range_m: float
     kind: np.ndarray
     opaque: np.ndarray
@@ -60,8 +60,9 @@ def build_reward_field(
 ) -> RewardField:
     """Prepare the volumes. `walked_poses` (N, 4, 4) tell which open voxels were looked at in vain."""
     grid, information = volume.grid, settings.information
+    enough = information.enough_quality(camera.fx)
     reach = min(settings.max_range_m, camera.far)
-    first = information_volumes(volume.arrays, information)
+    first = information_volumes(volume.arrays, information, enough)
     kind = first.kind
     through = _transmittance(volume, kind, settings)
     normal = np.zeros((*grid.shape, 3), np.int8)
@@ -71,10 +72,10 @@ def build_reward_field(
     quality = np.ascontiguousarray(first.quality).ravel()
     looks = _looks(volume, kind.ravel(), quality, normal.reshape(-1, 3), walked_poses, camera, settings)
     credit = np.float32(settings.credit_factor) ** looks.astype(np.float32)
-    volumes: InformationVolumes = information_volumes(volume.arrays, information, credit.reshape(grid.shape))
+    volumes: InformationVolumes = information_volumes(volume.arrays, information, enough, credit.reshape(grid.shape))
     return RewardField(
-        grid, information, reach, kind.ravel(), opaque, skip.ravel(), volumes.value.ravel(), through,
-        volumes.surface_value.ravel(), quality, normal.reshape(-1, 3),
+        grid, information.quality_range_m(camera.fx), enough, reach, kind.ravel(), opaque, skip.ravel(),
+        volumes.value.ravel(), through, volumes.surface_value.ravel(), quality, normal.reshape(-1, 3),
         volumes.gain_imp.ravel(), volumes.gain_exp.ravel(),
     )
 
@@ -124,19 +125,20 @@ def _looks(
         np.ascontiguousarray((chosen[:, :3, 3] - grid.origin) / grid.voxel_size, dtype=np.float32),
         np.ascontiguousarray(chosen[:, :3, :3], dtype=np.float32), fan, stops, kind, quality, normal,
         grid.shape, np.float32(grid.voxel_size), np.float32(reach),
-        np.float32(settings.information.enough_quality), np.float32(settings.information.quality_range_m),
+        np.float32(settings.information.enough_quality(camera.fx)),
+        np.float32(settings.information.quality_range_m(camera.fx)),
     )
 
 
 def sphere_rewards(field: RewardField, positions_world: np.ndarray, directions: Directions) -> np.ndarray:
     """(P, V) float32 reward of every view direction from every position (P, 3)."""
-    grid, info = field.grid, field.information
+    grid = field.grid
     origins = ((positions_world - grid.origin) / grid.voxel_size).astype(np.float32)
     rays = kernels.sphere_gain(
         np.ascontiguousarray(origins), directions.rays / np.float32(grid.voxel_size), directions.solid_angles,
         field.kind, field.skip, field.value, field.through, field.surface_value, field.quality, field.normal,
-        grid.shape, np.float32(grid.voxel_size), np.float32(field.max_range_m), np.float32(info.enough_quality),
-        np.float32(info.quality_range_m),
+        grid.shape, np.float32(grid.voxel_size), np.float32(field.max_range_m), np.float32(field.enough_quality),
+        np.float32(field.quality_range_m),
     )
     return rays @ directions.members.T
 
@@ -147,13 +149,13 @@ def exact_terms(
     """`GainTerms` of every pose (C, 4, 4) over its unique visible voxels, unknown ones by their visibility."""
     if len(poses) == 0:
         return []
-    grid, info = field.grid, field.information
+    grid = field.grid
     stride = ray_stride or fan_stride(camera, grid.voxel_size, field.max_range_m)
     sums = kernels.frustum_gain(
         np.ascontiguousarray((poses[:, :3, 3] - grid.origin) / grid.voxel_size, dtype=np.float32),
         np.ascontiguousarray(poses[:, :3, :3], dtype=np.float32), ray_fan(camera, stride)[2].astype(np.float32),
         field.opaque, field.kind, field.value, field.through, field.surface_value, field.quality, field.normal,
         field.gain_imp, field.gain_exp, grid.shape, np.float32(grid.voxel_size), np.float32(field.max_range_m),
-        np.float32(info.enough_quality), np.float32(info.quality_range_m),
+        np.float32(field.enough_quality), np.float32(field.quality_range_m),
     )
     return [GainTerms(s[0], s[1], s[2], s[3], round(s[4]), round(s[5])) for s in sums.tolist()]

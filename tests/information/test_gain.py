@@ -12,7 +12,10 @@ from active3d_pipe.information.gain import (
     view_quality,
     visible_information,
 )
-from active3d_pipe.structures import VOLUMES
+from active3d_pipe.structures import VOLUMES, Camera
+
+CAMERA = Camera.from_fov(600, 340, 90)
+ENOUGH = InformationSettings().enough_quality(CAMERA.fx)
 
 
 def volumes(n=4):
@@ -45,7 +48,7 @@ def test_kinds():
 
 def test_an_unseen_voxel_is_worth_its_weight_times_one_minus_occupancy():
     s = InformationSettings(alpha=0.7, beta=0.2)
-    v = information_volumes(volumes(), s)
+    v = information_volumes(volumes(), s, ENOUGH)
     np.testing.assert_allclose(v.value, (0.7 * 1 + 0.2 * 1) * 0.5, rtol=1e-6)
 
 
@@ -53,7 +56,7 @@ def test_seen_free_space_is_worth_nothing_even_when_uncertain():
     a = volumes()
     observe(a, 0, free=30, occupancy=0.5)
     a["u_final"][0] = 5
-    v = information_volumes(a, InformationSettings())
+    v = information_volumes(a, InformationSettings(), ENOUGH)
     assert v.value[0, 0, 0] == 0
     assert v.surface_value[0, 0, 0] == 0
     assert v.gain_imp[0, 0, 0] == 0
@@ -62,10 +65,10 @@ def test_seen_free_space_is_worth_nothing_even_when_uncertain():
 def test_surface_is_worth_a_look_until_it_was_seen_well():
     s = InformationSettings()
     rewards = []
-    for quality in (0.0, 0.5 * s.enough_quality, s.enough_quality, 1.0):
+    for quality in (0.0, 0.5 * ENOUGH, ENOUGH, 1.0):
         a = volumes()
         observe(a, 0, hit=9, occupancy=0.99, quality=quality)
-        rewards.append(visible_information(a, np.array([0]), s).reward)
+        rewards.append(visible_information(a, np.array([0]), CAMERA, s).reward)
     assert rewards[0] > 0
     assert rewards[1] == pytest.approx(0.5 * rewards[0])
     assert rewards[2] == rewards[3] == 0
@@ -75,7 +78,7 @@ def test_expected_entropy_reduction_leaves_the_residual():
     s = InformationSettings(residual_bits=0.25)
     a = volumes()
     a["entropy_exp"][:] = 0.1
-    terms = visible_information(a, np.array([0, 1, 2]), s)
+    terms = visible_information(a, np.array([0, 1, 2]), CAMERA, s)
     assert terms.gain_imp == pytest.approx(3 * 0.75)
     assert terms.gain_exp == 0
     assert terms.gain == terms.gain_imp
@@ -83,7 +86,7 @@ def test_expected_entropy_reduction_leaves_the_residual():
 
 
 def test_no_visible_voxels_no_gain():
-    terms = visible_information(volumes(), np.array([], dtype=np.int64))
+    terms = visible_information(volumes(), np.array([], dtype=np.int64), CAMERA)
     assert (terms.reward, terms.gain, terms.num_visible) == (0, 0, 0)
 
 
@@ -91,7 +94,7 @@ def test_credit_scales_everything_expected():
     a = volumes()
     observe(a, 1, hit=9, occupancy=0.99)
     s = InformationSettings()
-    full, half = information_volumes(a, s), information_volumes(a, s, np.full((4, 1, 1), 0.5))
+    full, half = information_volumes(a, s, ENOUGH), information_volumes(a, s, ENOUGH, np.full((4, 1, 1), 0.5))
     for name in ("value", "surface_value", "gain_imp", "gain_exp"):
         np.testing.assert_allclose(getattr(half, name), 0.5 * getattr(full, name), rtol=1e-6)
 
@@ -104,7 +107,14 @@ def test_uncertainty_is_measured_by_its_level_in_unseen_space():
 
 
 def test_view_quality_prefers_close_and_frontal():
-    s = InformationSettings(quality_range_m=1.0)
-    assert view_quality(1.0, 0.5, s) == 1
-    assert view_quality(-1.0, 2.0, s) == pytest.approx(0.5)
-    assert view_quality(0.5, 1.0, s) == pytest.approx(0.5)
+    assert view_quality(1.0, 0.5, 1.0) == 1
+    assert view_quality(-1.0, 2.0, 1.0) == pytest.approx(0.5)
+    assert view_quality(0.5, 1.0, 1.0) == pytest.approx(0.5)
+
+
+def test_enough_is_the_same_place_whatever_the_resolution():
+    s = InformationSettings(reference_footprint_m=0.005, enough_distance_m=3.0)
+    for width in (160, 600):
+        camera = Camera.from_fov(width, 90, 90)
+        at_three_metres = view_quality(1.0, 3.0, s.quality_range_m(camera.fx))
+        assert at_three_metres == pytest.approx(s.enough_quality(camera.fx))

@@ -51,7 +51,7 @@ class BoxWorld:
         axis = np.abs(local - np.round(local)).argmin(axis=1)
         cos = np.abs(d[np.arange(len(d)), axis])
         distance = np.linalg.norm(points - T[:3, 3], axis=1)
-        q = (cos * np.minimum(1, 1 / distance)).astype(np.float32)
+        q = (cos * np.minimum(1, 0.005 * self.camera.fx / distance)).astype(np.float32)
         v = self.grid.index_of(points)
         ok = self.grid.contains_index(v)
         np.maximum.at(self.quality, tuple(v[ok].T), q[ok])

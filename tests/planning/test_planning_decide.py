@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import box_world
 import numpy as np
 import pytest
@@ -35,7 +37,7 @@ def explore(world, start, *, budget, motion=MOTION, settings=SETTINGS, target=No
 def check_motion(world, walked, motion):
     """Every step within its limits, and the body truly clear along the whole way."""
     steps = np.linalg.norm(np.diff(walked[:, :3, 3], axis=0), axis=1)
-    turns = [se3.rotation_angle(a[:3, :3], b[:3, :3]) for a, b in zip(walked[:-1], walked[1:], strict=True)]
+    turns = [se3.rotation_angle(a[:3, :3], b[:3, :3]) for a, b in pairwise(walked)]
     assert steps.max() <= motion.max_step_m
     assert np.degrees(max(turns)) <= motion.max_turn_deg
     middle = 0.5 * (walked[:-1, :3, 3] + walked[1:, :3, 3])
@@ -45,7 +47,7 @@ def check_motion(world, walked, motion):
 def test_two_rooms_are_explored_without_touching_anything_and_then_it_stops():
     world = box_world.two_rooms()
     target, _ = box_world.reachable_surface(world, START)
-    settings = PlanningSettings(stop_reward=40.0)
+    settings = PlanningSettings(stop_reward=40.0, max_positions=250, exact_top=20, rrt_iterations=300)
     walked, decisions, curve = explore(world, START, budget=420, target=target, settings=settings)
     assert decisions[-1].reason is Reason.STOP_GAIN
     assert curve[-1] >= 0.96
@@ -164,7 +166,7 @@ def test_a_narrow_door_is_passed_with_less_clearance():
     poor = ~inside & (x > 1.7) & (x < 2.3) & ((y < 0.1) | (y > 1.9))
     volume["view_quality"][poor] = 0
     T = se3.pose_from_yaw_pitch(np.array([0.825, 1.025, 1.025]), np.pi, 0.0)
-    settings = PlanningSettings(stop_reward=6.0)
+    settings = PlanningSettings(stop_reward=20.0, clearance_margin_m=0.15)
     d = take(world, T[None], volume=volume, settings=settings)
     assert d.reason is Reason.RELAXED
     assert d.ranking[d.chosen].T_world_camera[0, 3] > 1.5
