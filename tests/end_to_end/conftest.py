@@ -17,7 +17,7 @@ steps = 30
 seed = 3
 
 [run.keep]
-last = 2
+last = 1000
 every = 1
 
 [camera]

@@ -1,5 +1,6 @@
 """A user's first hour: run, look, run again, resume, re-run a stage."""
 
+import itertools
 import json
 import subprocess
 from collections.abc import Callable
@@ -24,7 +25,7 @@ def test_run_leaves_everything_that_is_promised(tiny_run: Path) -> None:
 def test_steps_obey_the_budget_and_the_motion_limits(tiny_run: Path) -> None:
     frames = [f for p in sorted(tiny_run.glob("capture/*/frames.mcap")) for f in capture_log.read_frames(p)]
     assert [f.step for f in frames] == list(range(30))
-    for a, b in zip(frames, frames[1:], strict=False):
+    for a, b in itertools.pairwise(frames):
         assert np.linalg.norm(a.T_world_camera[:3, 3] - b.T_world_camera[:3, 3]) <= 0.1 + 1e-6
         cosine = (np.trace(a.T_world_camera[:3, :3].T @ b.T_world_camera[:3, :3]) - 1) / 2
         assert np.degrees(np.arccos(np.clip(cosine, -1, 1))) <= 10.01

@@ -3,7 +3,8 @@ import pytest
 import torch
 from room_with_ball import HIGH, LOW, RADIUS, SPHERE, render
 
-from active3d_pipe.field import FieldSettings, SdfField
+from active3d_pipe.field.config import FieldSettings
+from active3d_pipe.field.sdf_field import SdfField
 from active3d_pipe.geometry import se3
 from active3d_pipe.structures import Camera
 

@@ -5,8 +5,8 @@ import pytest
 from room_with_ball import scene_color, scene_sdf
 
 from active3d_pipe.errors import InputError
-from active3d_pipe.field import FieldSettings, sample_rays
-from active3d_pipe.field.rays import points_on_rays, sample_depths
+from active3d_pipe.field.config import FieldSettings
+from active3d_pipe.field.rays import points_on_rays, sample_depths, sample_rays
 from active3d_pipe.geometry import se3
 from active3d_pipe.structures import Camera, Frame
 

@@ -4,7 +4,10 @@ import torch
 from room_with_ball import HIGH, LOW, RADIUS, SPHERE, scene_sdf
 
 from active3d_pipe.errors import ArtifactError, ConfigError, NumericalError
-from active3d_pipe.field import FieldOptimiser, FieldSettings, SdfField, field_step, sample_rays
+from active3d_pipe.field.config import FieldSettings
+from active3d_pipe.field.optimise import FieldOptimiser, field_step
+from active3d_pipe.field.rays import sample_rays
+from active3d_pipe.field.sdf_field import SdfField
 
 FIT = FieldSettings(rays=512, grid_voxel_m=0.1)
 

@@ -6,7 +6,8 @@ from uncertainty_room import CAMERA, SIZE, frame, frames, pose, room_grid, trace
 
 from active3d_pipe.geometry import projection, se3, voxel_traversal
 from active3d_pipe.structures import Camera, Frame, VoxelGrid
-from active3d_pipe.uncertainty import UncertaintySettings, integrate_depth
+from active3d_pipe.uncertainty.carving import integrate_depth
+from active3d_pipe.uncertainty.config import UncertaintySettings
 
 EVERY_PIXEL = UncertaintySettings(ray_stride=1)
 

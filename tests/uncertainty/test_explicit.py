@@ -7,8 +7,14 @@ from uncertainty_room import CAMERA, frame, frames, pose, residual, room_grid
 from active3d_pipe.errors import InputError
 from active3d_pipe.geometry import projection
 from active3d_pipe.structures import Camera
-from active3d_pipe.uncertainty import UncertaintySettings, backproject, view_residuals
-from active3d_pipe.uncertainty.explicit import MIN_WEIGHT, explicit_uncertainty, most_uncertain
+from active3d_pipe.uncertainty.config import UncertaintySettings
+from active3d_pipe.uncertainty.explicit import (
+    MIN_WEIGHT,
+    backproject,
+    explicit_uncertainty,
+    most_uncertain,
+    view_residuals,
+)
 
 S = UncertaintySettings()
 

@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
 
 from active3d_pipe.errors import InputError
-from active3d_pipe.uncertainty import UncertaintySettings
+from active3d_pipe.uncertainty.config import UncertaintySettings
 from active3d_pipe.uncertainty.fusion import FusionStatistics, fuse, log_evidence, maximise_evidence
 
 S = UncertaintySettings()

@@ -13,7 +13,9 @@ from uncertainty_room import field, gaussians_on, room_grid
 from active3d_pipe.geometry import se3
 from active3d_pipe.information.entropy import bernoulli_entropy
 from active3d_pipe.structures import GaussianModel, VoxelGrid
-from active3d_pipe.uncertainty import RayEvidence, UncertaintySettings, implicit, occupancy
+from active3d_pipe.uncertainty import implicit, occupancy
+from active3d_pipe.uncertainty.carving import RayEvidence
+from active3d_pipe.uncertainty.config import UncertaintySettings
 
 S = UncertaintySettings()
 SHAPE = (2, 3, 2)

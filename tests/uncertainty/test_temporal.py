@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from active3d_pipe.uncertainty import UncertaintySettings
+from active3d_pipe.uncertainty.config import UncertaintySettings
 from active3d_pipe.uncertainty.temporal import temporal_uncertainty
 
 S = UncertaintySettings()

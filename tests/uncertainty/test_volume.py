@@ -17,7 +17,8 @@ from uncertainty_room import (
 from active3d_pipe.errors import InputError, NumericalError
 from active3d_pipe.geometry import projection
 from active3d_pipe.structures import VOLUMES, GaussianModel, VoxelGrid
-from active3d_pipe.uncertainty import UncertaintySettings, compute_volume, make_grid
+from active3d_pipe.uncertainty.config import UncertaintySettings
+from active3d_pipe.uncertainty.volume import compute_volume, make_grid
 
 GRID = room_grid()
 S = UncertaintySettings(ray_stride=2, residual_stride=1)

@@ -4,7 +4,7 @@ import numpy as np
 
 from active3d_pipe.geometry import projection, se3
 from active3d_pipe.structures import Camera, Frame, GaussianModel, VoxelGrid
-from active3d_pipe.uncertainty import ViewResidual, view_residuals
+from active3d_pipe.uncertainty.explicit import ViewResidual, view_residuals
 
 SIZE = np.array([3.05, 2.45, 2.05])
 BOX_LOW, BOX_HIGH = np.array([1.85, 0.85, 0.0]), np.array([2.45, 1.45, 0.95])
