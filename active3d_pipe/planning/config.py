@@ -15,12 +15,12 @@ class PlanningSettings(Settings):
     # Candidates.
     coarse_spacing_m: float = Field(0.5, gt=0, description="spacing of candidate positions over all free space, m")
     fine_spacing_m: float = Field(0.25, gt=0, description="spacing of the positions around the best coarse ones, m")
-    max_positions: int = Field(500, ge=1, description="coarse positions at most; the spacing grows to keep to it")
+    max_positions: int = Field(400, ge=1, description="coarse positions at most; the spacing grows to keep to it")
     refine_top: int = Field(4, ge=0, description="coarse positions that are refined")
     num_yaws: int = Field(24, ge=1, description="view directions around the vertical, evenly spread")
     pitches_deg: tuple[float, ...] = Field((-35.0, 0.0, 30.0), min_length=1, description="view pitch, degrees, up > 0")
     max_range_m: float = Field(5.0, gt=0, description="how far a view is expected to see, m")
-    exact_top: int = Field(32, ge=1, description="candidates whose visible set is computed exactly")
+    exact_top: int = Field(24, ge=1, description="candidates whose visible set is computed exactly")
     unknown_free_path_m: float = Field(
         1.0, gt=0, description="mean length of a ray through unknown space before something stops it, m"
     )

@@ -83,7 +83,7 @@ def sphere_gain(
 
 @njit(parallel=True, fastmath=True, cache=True)
 def frustum_gain(
-    origins, rotations, fan, opaque, kind, value, through, surface_value, quality, normal, gain_imp, gain_exp,
+    origins, rotations, fan, opaque, kind, value, log_through, surface_value, quality, normal, gain_imp, gain_exp,
     shape, voxel_size, max_range, enough, quality_range,
 ):
     """Exact sums over the unique visible voxels of every candidate view.
@@ -108,8 +108,8 @@ def frustum_gain(
                 dy = (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z) / voxel_size
                 dz = (R[2, 0] * x + R[2, 1] * y + R[2, 2] * z) / voxel_size
                 n = walk_ray(opaque, ox, oy, oz, dx, dy, dz, max_range, nx, ny, nz, ids)
-                transmittance = ONE
-                # `through` belongs to a length of one voxel; a slanted ray crosses more of them, in shorter pieces.
+                transmittance, depth = ONE, ZERO
+                # A transmittance belongs to a length of one voxel; a slanted ray crosses more of them, in shorter pieces.
                 piece = ONE / (voxel_size * (abs(dx) + abs(dy) + abs(dz)))
                 for m in range(n):
                     v = ids[m]
@@ -137,7 +137,8 @@ def frustum_gain(
                                 out[c, 2] += part * gain_imp[v]
                                 out[c, 3] += part * gain_exp[v]
                     if kind[v] == 1:
-                        transmittance *= through[v] ** piece
+                        depth += log_through[v] * piece
+                        transmittance = np.exp(depth)
                         if transmittance < LEAST_TRANSMITTANCE:
                             break
     return out

@@ -154,8 +154,9 @@ def exact_terms(
     sums = kernels.frustum_gain(
         np.ascontiguousarray((poses[:, :3, 3] - grid.origin) / grid.voxel_size, dtype=np.float32),
         np.ascontiguousarray(poses[:, :3, :3], dtype=np.float32), ray_fan(camera, stride)[2].astype(np.float32),
-        field.opaque, field.kind, field.value, field.through, field.surface_value, field.quality, field.normal,
-        field.gain_imp, field.gain_exp, grid.shape, np.float32(grid.voxel_size), np.float32(field.max_range_m),
+        field.opaque, field.kind, field.value, np.log(np.maximum(field.through, np.float32(1e-6))),
+        field.surface_value, field.quality, field.normal, field.gain_imp, field.gain_exp, grid.shape,
+        np.float32(grid.voxel_size), np.float32(field.max_range_m),
         np.float32(field.enough_quality), np.float32(field.quality_range_m),
     )
     return [GainTerms(s[0], s[1], s[2], s[3], round(s[4]), round(s[5])) for s in sums.tolist()]
