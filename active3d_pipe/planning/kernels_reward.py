@@ -109,7 +109,7 @@ def frustum_gain(
                 dz = (R[2, 0] * x + R[2, 1] * y + R[2, 2] * z) / voxel_size
                 n = walk_ray(opaque, ox, oy, oz, dx, dy, dz, max_range, nx, ny, nz, ids)
                 transmittance, depth = ONE, ZERO
-                # A transmittance belongs to a length of one voxel; a slanted ray crosses more of them, in shorter pieces.
+                # A transmittance belongs to the length of one voxel; a slanted ray crosses more, in shorter pieces.
                 piece = ONE / (voxel_size * (abs(dx) + abs(dy) + abs(dz)))
                 for m in range(n):
                     v = ids[m]
