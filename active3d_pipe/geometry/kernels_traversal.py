@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Numba kernels of voxel traversal; `reference_traversal.py` is the slow, obvious twin.
 
 All kernels work in voxel units: a point is (world - grid.origin) / voxel_size, so voxel (i, j, k) is the cube

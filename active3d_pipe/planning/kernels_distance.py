@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Numba kernels on the voxel grid: truncated distance transforms, geodesic distances."""
 
 import numpy as np

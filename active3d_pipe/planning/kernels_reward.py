@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Numba kernels of the reward; `reference_reward.py` is their slow twin.
 
 Points are in voxel units, directions unit vectors / voxel_size, ray parameters in metres (as in

@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Numba kernel of RRT*; `rrt_star.py` explains it."""
 
 import numpy as np
