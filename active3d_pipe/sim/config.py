@@ -47,7 +47,7 @@ class SensorSettings(Settings):
         "raycast", description="renderer: raycast (Open3D) or pyrender (EGL)"
     )
     edge_samples: int = Field(
-        8, ge=0, le=64, description="colour samples of a pixel that holds an edge; 0 = no supersampling"
+        10, ge=0, le=64, description="colour samples of a pixel that holds an edge; 0 = no supersampling"
     )
     depth_noise_base_m: float = Field(0.0, ge=0, description="constant part of the depth noise's standard deviation, m")
     depth_noise_per_m2: float = Field(

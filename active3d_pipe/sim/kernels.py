@@ -12,7 +12,9 @@ from numba import njit, prange
 
 NO_HIT = np.uint32(0xFFFFFFFF)
 _CHUNK = 512
-_BYTE, _GREEN, _BLUE, _ALPHA = np.int32(255), np.int32(8), np.int32(16), np.int32(24)
+# Layout of a texel, int64: red from bit 0, green from bit 21, blue from bit 42.
+_FIELD, _GREEN, _BLUE = np.int64(0x1FFFFF), np.int64(21), np.int64(42)
+_UNIT_WEIGHT = np.float32(1 / 4096)
 _SINGLE_LEVEL = np.float32(0.06)  # so near to a mip level the other one is not read
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 
@@ -37,17 +39,16 @@ def _bilinear(texels, offset, width, height, u, v):
     y0, y1 = y0 + height if y0 < 0 else y0, y1 - height if y1 >= height else y1
     x0, y0 = min(x0, width - 1), min(y0, height - 1)
     row0, row1 = offset + y0 * width, offset + y1 * width
-    # Unsigned indices spare the test for negative ones.
-    q00, q10 = texels[np.uint64(row0 + x0)], texels[np.uint64(row0 + x1)]
-    q01, q11 = texels[np.uint64(row1 + x0)], texels[np.uint64(row1 + x1)]
-    w00, w10 = (_ONE - ax) * (_ONE - ay), ax * (_ONE - ay)
-    w01, w11 = (_ONE - ax) * ay, ax * ay
-    r = (w00 * np.float32(q00 & _BYTE) + w10 * np.float32(q10 & _BYTE)
-         + w01 * np.float32(q01 & _BYTE) + w11 * np.float32(q11 & _BYTE))
-    g = (w00 * np.float32((q00 >> _GREEN) & _BYTE) + w10 * np.float32((q10 >> _GREEN) & _BYTE)
-         + w01 * np.float32((q01 >> _GREEN) & _BYTE) + w11 * np.float32((q11 >> _GREEN) & _BYTE))
-    b = (w00 * np.float32((q00 >> _BLUE) & _BYTE) + w10 * np.float32((q10 >> _BLUE) & _BYTE)
-         + w01 * np.float32((q01 >> _BLUE) & _BYTE) + w11 * np.float32((q11 >> _BLUE) & _BYTE))
+    # Unsigned indices spare the test for negative ones. The three channels are blended along x at once, each in 21 bits
+    # of one integer: 8 bits of value times 12 bits of weight.
+    w1 = np.int64(ax * np.float32(4096) + _HALF)
+    w0 = np.int64(4096) - w1
+    top = texels[np.uint64(row0 + x0)] * w0 + texels[np.uint64(row0 + x1)] * w1
+    low = texels[np.uint64(row1 + x0)] * w0 + texels[np.uint64(row1 + x1)] * w1
+    v0, v1 = (_ONE - ay) * _UNIT_WEIGHT, ay * _UNIT_WEIGHT
+    r = v0 * np.float32(top & _FIELD) + v1 * np.float32(low & _FIELD)
+    g = v0 * np.float32((top >> _GREEN) & _FIELD) + v1 * np.float32((low >> _GREEN) & _FIELD)
+    b = v0 * np.float32((top >> _BLUE) & _FIELD) + v1 * np.float32((low >> _BLUE) & _FIELD)
     return r, g, b
 
 
@@ -62,6 +63,12 @@ def filtered_texture(texels, levels, first, last, u, v, ux, vx, uy, vy, bias, ma
     width, height = np.float32(levels[first, 1]), np.float32(levels[first, 2])
     ax, ay = ux * width, vx * height
     bx, by = uy * width, vy * height
+    if max_probes <= 1:
+        # One lookup: the level whose texels have the footprint's area.
+        area = abs(ax * by - ay * bx)
+        k = np.int64(_HALF * np.float32(math.log2(max(area, _ONE))) + bias + _HALF)
+        k = first + min(max(k, 0), last - first - 1)
+        return _bilinear(texels, levels[k, 0], levels[k, 1], levels[k, 2], u, v)
     # Axes of the ellipse J (unit disc), J = [a b]: eigen-decomposition of J J^T.
     e, f, g = ax * ax + bx * bx, ax * ay + bx * by, ay * ay + by * by
     mean, diff = _HALF * (e + g), _HALF * (e - g)
@@ -288,14 +295,17 @@ def sample_rays(pixels, offsets, width, T, inv_fx, inv_fy, cx, cy, rays):
 
 
 @njit(parallel=True, fastmath=True, cache=True)
-def sum_samples(samples, total, spread):
-    """Sum (P, 3) and spread (P,) (largest range over the channels, 0..255) of each pixel's samples (P, K, 3)."""
+def sum_samples(samples, centre, total, spread):
+    """Sum (P, 3) of each pixel's samples (P, K, 3), and spread (P,), the largest range over the channels, 0..255.
+
+    `centre` (P, 3), the sample at the pixel's centre, counts for the spread alone.
+    """
     for p in prange(len(samples)):
         widest = _ZERO
         for c in range(3):
-            low = high = samples[p, 0, c]
-            value = low
-            for s in range(1, samples.shape[1]):
+            low = high = centre[p, c]
+            value = _ZERO
+            for s in range(samples.shape[1]):
                 x = samples[p, s, c]
                 value += x
                 low, high = min(low, x), max(high, x)
@@ -337,7 +347,7 @@ def plane_hits(rays, face, vertices, faces, t, bary):
 
 
 @njit(parallel=True, cache=True)
-def holes(face, bary, face_material, cutoff, uv, mip_range, levels, texels, out):
+def holes(face, bary, face_material, cutoff, uv, mip_range, levels, alphas, out):
     """(N,) bool, whether a hit falls on a texel whose alpha is below its material's cutoff (0..255, < 0 = none)."""
     for n in prange(len(face)):
         out[n] = False
@@ -355,7 +365,7 @@ def holes(face, bary, face_material, cutoff, uv, mip_range, levels, texels, out)
         v = b0 * uv[f, 0, 1] + b1 * uv[f, 1, 1] + b2 * uv[f, 2, 1]
         x = _wrap(np.int64(math.floor(u * width)), width)
         y = _wrap(np.int64(math.floor(v * height)), height)
-        out[n] = ((texels[offset + y * width + x] >> _ALPHA) & _BYTE) < cutoff[m]
+        out[n] = alphas[offset + y * width + x] < cutoff[m]
 
 
 @njit(cache=True)

@@ -65,7 +65,7 @@ def read_soup(path: Path) -> Soup:
         if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
             warnings.append(f"{geometry_name}: no faces, ignored")
             continue
-        key = id(getattr(mesh.visual, "material", None)) if mesh.visual.kind == "texture" else id(mesh)
+        key = id(getattr(mesh.visual, "material", None)) if cast(Any, mesh.visual).kind == "texture" else id(mesh)
         if key not in known:
             known[key] = len(materials)
             materials.append(_material(mesh, geometry_name, warnings))

@@ -13,8 +13,8 @@ from active3d_pipe.structures import Camera, Frame, check_pose
 
 # Colour steps, 0..255. Below the first an edge is not worth more samples (an unresolved edge of step s costs a variance
 # of s^2 / 12 in its pixel); from the second on any change of face counts as an edge, for pictures that share a material
-# with what surrounds them; a pixel whose first samples differ by more than the third gets the others too.
-_CONTRAST, _TEXTURE_CONTRAST, _SPREAD = 6.0, 32.0, 12.0
+# with what surrounds them; a pixel whose first samples and centre differ by more than the third gets the others too.
+_CONTRAST, _TEXTURE_CONTRAST, _SPREAD = 6.0, 32.0, 40.0
 _CLEARANCE_STEP_M = 0.005
 
 
@@ -118,14 +118,14 @@ class SurfaceRenderer(ABC):
         )
         pixels = np.flatnonzero(contrast)
         total, count = np.zeros((len(pixels), 3), np.float32), np.zeros(len(pixels), np.float32)
-        doubtful = np.arange(len(pixels))
+        centre, doubtful = rgb[pixels], np.arange(len(pixels))
         for part in range(self._parts):
             if len(doubtful) == 0:
                 break
             samples, k = self._samples(T, pixels[doubtful], part)
             colours, _ = self._shade(T, samples, 1 / np.sqrt(k), shading.SAMPLE_PROBES)
             sums, spread = np.empty((len(doubtful), 3), np.float32), np.empty(len(doubtful), np.float32)
-            kernels.sum_samples(colours.reshape(len(doubtful), k, 3), sums, spread)
+            kernels.sum_samples(colours.reshape(len(doubtful), k, 3), centre[doubtful], sums, spread)
             total[doubtful] += sums
             count[doubtful] += k
             doubtful = doubtful[spread > _SPREAD]
@@ -165,5 +165,5 @@ class SurfaceRenderer(ABC):
         """(N,) bool, hits on holes of alpha masks."""
         a = self._packed.arrays
         out = np.empty(len(hits.face), np.bool_)
-        kernels.holes(hits.face, hits.bary, a[2], self._packed.cutoff, a[3], a[7], a[8], a[9], out)
+        kernels.holes(hits.face, hits.bary, a[2], self._packed.cutoff, a[3], a[7], a[8], self._packed.alphas, out)
         return out

@@ -56,8 +56,6 @@ class Scene:
 
     def __post_init__(self) -> None:
         check_pose(self.start_pose, f"scene {self.name}: start pose")
-        if not (self.bounds_high > self.bounds_low).all():
-            raise InputError(f"scene {self.name}: bounds {self.bounds_low} .. {self.bounds_high}, expected low < high")
 
 
 def load_scene(settings: SceneSettings) -> Scene:
@@ -90,6 +88,8 @@ def load_scene(settings: SceneSettings) -> Scene:
         low, high = placement.find_bounds(vertices, soup.faces)
     else:
         low, high = (np.asarray(corner, dtype=np.float64) for corner in settings.bounds)
+    if not (high > low).all():
+        raise InputError(f"{where}: scene.bounds {low.tolist()} .. {high.tolist()}, expected low < high on every axis")
     floor_z = placement.find_floor(vertices, soup.faces, low[2], high[2])
     start, notes = _start_pose(settings, sidecar, SurfaceIndex(vertices, soup.faces), low, high, floor_z, where)
     return Scene(
