@@ -70,16 +70,17 @@ def test_texture_filter_comes_near_the_supersampled_pixel():
     assert filtered_error < 0.25 * point_error
 
 
-def test_one_probe_stays_near_the_full_filter_on_round_footprints():
+def test_one_probe_comes_near_the_supersampled_pixel_on_round_footprints():
     image = texture(64, 64, 1.5)
     mips = mip_pyramid(image)
     texels, levels = packed(mips)
-    rng = np.random.default_rng(4)
+    rng, errors = np.random.default_rng(4), []
     for _ in range(40):
         uv, size = rng.uniform(0, 1, 2), rng.uniform(0.2, 2)
         du_dv = np.eye(2) * size / 64
         truth = reference.box_filtered_texture(image, uv, du_dv)
-        assert kernel_value(texels, levels, uv, du_dv, shading.TEXTURE_BIAS, 1) == pytest.approx(truth, abs=14)
+        errors.append(kernel_value(texels, levels, uv, du_dv, shading.TEXTURE_BIAS, 1) - truth)
+    assert np.sqrt(np.mean(np.square(errors))) < 6
 
 
 @pytest.mark.parametrize("shape", [(8, 8), (7, 5), (1, 6), (13, 1), (1, 1)])

@@ -30,11 +30,12 @@ def test_reachable_space_stays_in_the_room_of_the_start(sim, space):
     centres = space.grid.centres()[space.reachable]
     assert (centres > 0.2).all() and (centres < np.array([4.8, 3.8, 2.4]) + 1e-6).all()
     assert (sim.clearance(centres) > 0.2).all()
-    # Volume by sampling: the room less what is within 0.2 m of a surface.
+    # Volume by sampling: the room less what is within 0.2 m of a surface. Voxel centres fall on the limits here, so
+    # each side may lose half a voxel: 2 % in x, 3 % in y, 5 % in z.
     points = np.random.default_rng(0).uniform([0, 0, 0], [5, 4, 2.6], (20000, 3))
     expected = (sim.clearance(points) > 0.2).mean() * 5 * 4 * 2.6
     inside_closet = 0.4 * 0.4 * 1.6  # clear, but closed
-    assert space.volume_m3 == pytest.approx(expected - inside_closet, rel=0.05)
+    assert space.volume_m3 == pytest.approx(expected - inside_closet, rel=0.10)
 
 
 def test_a_sphere_that_fits_nowhere(sim):
