@@ -49,7 +49,7 @@ class FieldSettings(Settings):
     weight_depth: float = Field(0.1, ge=0, description="weight of the rendered depth loss, 1/m2")
     weight_sdf: float = Field(1000.0, ge=0, description="weight of the SDF loss in the truncation band, 1/m2")
     weight_free: float = Field(10.0, ge=0, description="weight of the free-space loss, in truncation units")
-    weight_uncertainty: float = Field(0.005, ge=0, description="weight of the uncertainty losses")
+    weight_uncertainty: float = Field(0.02, ge=0, description="weight of the uncertainty losses")
     weight_prior: float = Field(0.005, ge=0, description="weight of the uncertainty prior in unseen space")
     weight_smoothness: float = Field(0.001, ge=0, description="weight of the smoothness loss, in truncation units")
     smoothness_step_m: float = Field(0.05, gt=0, description="distance of the point pairs of the smoothness loss, m")

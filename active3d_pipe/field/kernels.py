@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Encoders of the implicit branch: OneBlob, multi-resolution tri-plane, dense feature grid.
 
 Tables are channel-last, so that one node is one or two cache lines. Nodes sit on the corners of the cells:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from active3d_pipe.geometry.projection import pixel_rays
+from active3d_pipe.geometry.projection import in_image, pixel_rays, project
 from active3d_pipe.structures import Frame
 
 LOW, HIGH = np.array([-1.0, -1.2, 0.0]), np.array([1.0, 1.2, 1.6])
@@ -32,3 +32,14 @@ def render(camera, T, step=0):
     z = np.where((disc > 0) & (hit > 0), np.minimum(t, hit), t)
     rgb = (255 * scene_color(o + z[..., None] * d)).astype(np.uint8)
     return Frame(step, step, camera, T, rgb, z.astype(np.float32))
+
+
+def seen_by(frames, points):
+    """(N,) bool, surface points that at least one frame shows."""
+    seen = np.zeros(len(points), bool)
+    for f in frames:
+        uv, z = project(points, f.T_world_camera, f.camera)
+        at = np.flatnonzero(in_image(uv, z, f.camera))
+        j, i = uv[at].astype(int).T
+        seen[at] |= np.abs(z[at] - f.depth[i, j]) < 0.03
+    return seen

@@ -61,16 +61,25 @@ def test_rgb_and_depth_loss():
 
 
 def test_uncertainty_loss_is_least_at_the_true_variance_and_leaves_geometry_alone():
-    residual = torch.tensor(np.random.default_rng(3).normal(0, 0.3, 5000), requires_grad=True)
+    residual = torch.tensor(np.random.default_rng(3).normal(0, 0.2, 1000), requires_grad=True)
     log_var = torch.zeros((), dtype=torch.float64, requires_grad=True)
     optimiser = torch.optim.Adam([log_var], lr=0.1)
-    mask = torch.ones(5000, dtype=torch.bool)
+    mask = torch.ones(1000, dtype=torch.bool)
     for _ in range(200):
         optimiser.zero_grad()
-        losses.uncertainty_loss(residual, log_var.exp().expand(5000), mask).backward()
+        losses.uncertainty_loss(residual, log_var.exp().expand(1000), mask).backward()
         optimiser.step()
     assert math.exp(log_var.item() / 2) == pytest.approx(residual.std().item(), rel=0.02)
     assert residual.grad is None
+
+
+def test_uncertainty_loss_takes_an_outlier_for_one_truncation():
+    variance = torch.full((1,), 0.04, requires_grad=True)
+    mask = torch.ones(1, dtype=torch.bool)
+    far, near = (losses.uncertainty_loss(torch.tensor([e]), variance, mask) for e in (50.0, 1.0))
+    assert far.item() == near.item() == pytest.approx(0.2 * (1 / 0.08 + 0.5 * math.log(0.04)))
+    (gradient,) = torch.autograd.grad(near, variance)
+    assert gradient.item() == pytest.approx(0.2 * (0.5 / 0.04 - 0.5 / 0.04**2))
 
 
 def test_prior_and_smoothness_loss():
