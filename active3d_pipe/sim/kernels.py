@@ -368,6 +368,14 @@ def holes(face, bary, face_material, cutoff, uv, mip_range, levels, alphas, out)
         out[n] = alphas[offset + y * width + x] < cutoff[m]
 
 
+@njit(parallel=True, cache=True)
+def pack_texels(rgba, colours, alphas):
+    """Spread texels (T, 4) uint8 into `colours` (T,) int64 of 21 bits a channel, and `alphas` (T,) uint8."""
+    for n in prange(len(rgba)):
+        colours[n] = np.int64(rgba[n, 0]) | (np.int64(rgba[n, 1]) << _GREEN) | (np.int64(rgba[n, 2]) << _BLUE)
+        alphas[n] = rgba[n, 3]
+
+
 @njit(cache=True)
 def crease_normals(faces, starts, corners, merged, face_normal, face_area, cos_crease, out):
     """Corner normals (F, 3, 3) int16 (unit = 32767): area-weighted over adjacent faces within the crease angle.

@@ -91,8 +91,9 @@ def pack_texels(images: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     if not images:
         return np.zeros(1, np.int64), np.full(1, 255, np.uint8)
     flat = np.concatenate([image.reshape(-1, 4) for image in images])
-    wide = flat[:, :3].astype(np.int64)
-    return wide[:, 0] | wide[:, 1] << 21 | wide[:, 2] << 42, np.ascontiguousarray(flat[:, 3])
+    colours, alphas = np.empty(len(flat), np.int64), np.empty(len(flat), np.uint8)
+    kernels.pack_texels(flat, colours, alphas)
+    return colours, alphas
 
 
 def distance_grid(
