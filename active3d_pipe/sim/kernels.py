@@ -20,12 +20,6 @@ _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 
 
 @njit(inline="always")
-def _wrap(i, n):
-    i = i % n
-    return i + n if i < 0 else i
-
-
-@njit(inline="always")
 def _bilinear(texels, offset, width, height, u, v):
     """RGB in 0..255 at (u, v) of one mip level that repeats."""
     x = (u - np.float32(math.floor(u))) * np.float32(width) - _HALF
@@ -312,95 +306,3 @@ def sum_samples(samples, centre, total, spread):
             total[p, c] = value
             widest = max(widest, high - low)
         spread[p] = widest
-
-
-@njit(parallel=True, cache=True)
-def plane_hits(rays, face, vertices, faces, t, bary):
-    """Exact t and barycentric coordinates of rays on the planes of the faces they are known to meet (float64)."""
-    for n in prange(len(face)):
-        f = face[n]
-        if f == NO_HIT:
-            t[n] = np.inf
-            bary[n, 0] = _ZERO
-            bary[n, 1] = _ZERO
-            continue
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        e1 = np.empty(3)
-        e2 = np.empty(3)
-        s = np.empty(3)
-        d = np.empty(3)
-        for k in range(3):
-            e1[k] = float(vertices[b, k]) - float(vertices[a, k])
-            e2[k] = float(vertices[c, k]) - float(vertices[a, k])
-            s[k] = float(rays[n, k]) - float(vertices[a, k])
-            d[k] = float(rays[n, 3 + k])
-        px, py, pz = d[1] * e2[2] - d[2] * e2[1], d[2] * e2[0] - d[0] * e2[2], d[0] * e2[1] - d[1] * e2[0]
-        det = e1[0] * px + e1[1] * py + e1[2] * pz
-        if abs(det) < 1e-18:
-            det = 1e-18
-        qx, qy, qz = s[1] * e1[2] - s[2] * e1[1], s[2] * e1[0] - s[0] * e1[2], s[0] * e1[1] - s[1] * e1[0]
-        u = (s[0] * px + s[1] * py + s[2] * pz) / det
-        v = (d[0] * qx + d[1] * qy + d[2] * qz) / det
-        t[n] = (e2[0] * qx + e2[1] * qy + e2[2] * qz) / det
-        bary[n, 0] = min(max(u, 0.0), 1.0)
-        bary[n, 1] = min(max(v, 0.0), 1.0 - bary[n, 0])
-
-
-@njit(parallel=True, cache=True)
-def holes(face, bary, face_material, cutoff, uv, mip_range, levels, alphas, out):
-    """(N,) bool, whether a hit falls on a texel whose alpha is below its material's cutoff (0..255, < 0 = none)."""
-    for n in prange(len(face)):
-        out[n] = False
-        f = face[n]
-        if f == NO_HIT:
-            continue
-        m = face_material[f]
-        if cutoff[m] < 0 or mip_range[m, 1] <= mip_range[m, 0]:
-            continue
-        level = mip_range[m, 0]
-        offset, width, height = levels[level, 0], levels[level, 1], levels[level, 2]
-        b1, b2 = bary[n, 0], bary[n, 1]
-        b0 = 1 - b1 - b2
-        u = b0 * uv[f, 0, 0] + b1 * uv[f, 1, 0] + b2 * uv[f, 2, 0]
-        v = b0 * uv[f, 0, 1] + b1 * uv[f, 1, 1] + b2 * uv[f, 2, 1]
-        x = _wrap(np.int64(math.floor(u * width)), width)
-        y = _wrap(np.int64(math.floor(v * height)), height)
-        out[n] = alphas[offset + y * width + x] < cutoff[m]
-
-
-@njit(parallel=True, cache=True)
-def pack_texels(rgba, colours, alphas):
-    """Spread texels (T, 4) uint8 into `colours` (T,) int64 of 21 bits a channel, and `alphas` (T,) uint8."""
-    for n in prange(len(rgba)):
-        colours[n] = np.int64(rgba[n, 0]) | (np.int64(rgba[n, 1]) << _GREEN) | (np.int64(rgba[n, 2]) << _BLUE)
-        alphas[n] = rgba[n, 3]
-
-
-@njit(cache=True)
-def crease_normals(faces, starts, corners, merged, face_normal, face_area, cos_crease, out):
-    """Corner normals (F, 3, 3) int16 (unit = 32767): area-weighted over adjacent faces within the crease angle.
-
-    `merged` (F, 3) vertex ids after merging equal positions; `starts` (M + 1,), `corners`: the corners 3 f + c of every
-    merged vertex (CSR). A neighbour wound the other way counts with its normal turned.
-    """
-    for f in range(len(faces)):
-        for c in range(3):
-            v = merged[f, c]
-            begin, end = starts[v], starts[v + 1]
-            x, y, z = face_normal[f, 0], face_normal[f, 1], face_normal[f, 2]
-            x, y, z = x * face_area[f], y * face_area[f], z * face_area[f]
-            if end - begin <= 256:
-                for k in range(begin, end):
-                    g = corners[k] // 3
-                    if g == f:
-                        continue
-                    dot = (face_normal[f, 0] * face_normal[g, 0] + face_normal[f, 1] * face_normal[g, 1]
-                           + face_normal[f, 2] * face_normal[g, 2])
-                    if abs(dot) > cos_crease:
-                        w = face_area[g] if dot > 0 else -face_area[g]
-                        x, y, z = x + w * face_normal[g, 0], y + w * face_normal[g, 1], z + w * face_normal[g, 2]
-            norm = math.sqrt(x * x + y * y + z * z)
-            if norm > 0:
-                out[f, c, 0] = np.int16(round(32767 * x / norm))
-                out[f, c, 1] = np.int16(round(32767 * y / norm))
-                out[f, c, 2] = np.int16(round(32767 * z / norm))

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from active3d_pipe.errors import Active3dError, ConfigError
-from active3d_pipe.sim import kernels
+from active3d_pipe.sim import kernels, kernels_mesh
 from active3d_pipe.sim.config import SensorSettings
 from active3d_pipe.sim.rendering import Hits, SurfaceRenderer
 from active3d_pipe.sim.scene import Scene
@@ -155,5 +155,5 @@ class PyrenderSimulator(SurfaceRenderer):
     def _on_planes(self, rays: np.ndarray, face: np.ndarray) -> Hits:
         face = np.ascontiguousarray(face)
         t, bary = np.empty(len(face), np.float32), np.empty((len(face), 2), np.float32)
-        kernels.plane_hits(rays, face, self._packed.arrays[0], self._packed.arrays[1], t, bary)
+        kernels_mesh.plane_hits(rays, face, self._packed.arrays[0], self._packed.arrays[1], t, bary)
         return Hits(rays, t, face, bary)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from active3d_pipe.geometry.raycasting import SurfaceIndex
-from active3d_pipe.sim import kernels, noise, shading
+from active3d_pipe.sim import kernels, kernels_mesh, noise, shading
 from active3d_pipe.sim.config import SensorSettings
 from active3d_pipe.sim.scene import Scene
 from active3d_pipe.structures import Camera, Frame, check_pose
@@ -165,5 +165,5 @@ class SurfaceRenderer(ABC):
         """(N,) bool, hits on holes of alpha masks."""
         a = self._packed.arrays
         out = np.empty(len(hits.face), np.bool_)
-        kernels.holes(hits.face, hits.bary, a[2], self._packed.cutoff, a[3], a[7], a[8], self._packed.alphas, out)
+        kernels_mesh.holes(hits.face, hits.bary, a[2], self._packed.cutoff, a[3], a[7], a[8], self._packed.alphas, out)
         return out

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from active3d_pipe.geometry.raycasting import SurfaceIndex
-from active3d_pipe.sim import kernels
+from active3d_pipe.sim import kernels_mesh
 from active3d_pipe.sim.placement import face_areas
 from active3d_pipe.sim.scene import Scene
 
@@ -92,7 +92,7 @@ def pack_texels(images: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros(1, np.int64), np.full(1, 255, np.uint8)
     flat = np.concatenate([image.reshape(-1, 4) for image in images])
     colours, alphas = np.empty(len(flat), np.int64), np.empty(len(flat), np.uint8)
-    kernels.pack_texels(flat, colours, alphas)
+    kernels_mesh.pack_texels(flat, colours, alphas)
     return colours, alphas
 
 
@@ -123,7 +123,7 @@ def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease_deg: float = 
     corners = np.argsort(merged.reshape(-1), kind="stable")
     starts = np.concatenate([[0], np.cumsum(np.bincount(merged.reshape(-1), minlength=len(unique)))])
     out = np.zeros((len(faces), 3, 3), np.int16)
-    kernels.crease_normals(
+    kernels_mesh.crease_normals(
         np.ascontiguousarray(faces), starts, corners, merged, normal, area, float(np.cos(np.radians(crease_deg))), out
     )
     return out

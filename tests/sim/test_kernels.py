@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from active3d_pipe.sim import kernels, reference, shading
+from active3d_pipe.sim import kernels, kernels_mesh, reference, shading
 from active3d_pipe.sim.materials import mip_pyramid
 
 
@@ -131,7 +131,7 @@ def test_plane_hits_match_the_ray_caster(room_sim):
     t, face, bary = room_sim.surface.cast(rays)
     scene = room_sim.scene
     t2, bary2 = np.empty_like(t), np.empty_like(bary)
-    kernels.plane_hits(rays, face, scene.vertices, scene.faces, t2, bary2)
+    kernels_mesh.plane_hits(rays, face, scene.vertices, scene.faces, t2, bary2)
     assert t2 == pytest.approx(t, rel=1e-5)
     assert bary2 == pytest.approx(bary, abs=1e-4)
     corner = scene.vertices[scene.faces[face]]
