@@ -10,7 +10,7 @@ from skimage.measure import marching_cubes
 
 from active3d_pipe.errors import ConfigError, InputError
 from active3d_pipe.export.config import MeshSettings
-from active3d_pipe.geometry import projection
+from active3d_pipe.export.kernels_culling import mark_seen
 from active3d_pipe.structures import Frame, TriangleMesh, VoxelGrid
 
 QuerySdf = Callable[[np.ndarray], np.ndarray]
@@ -216,23 +216,13 @@ def cull_unseen(mesh: TriangleMesh, frames: Iterable[Frame], settings: MeshSetti
     seen = np.zeros(len(mesh.faces), bool)
     pending = np.arange(len(mesh.faces))
     for frame in frames:
-        visible = _sees(frame, centroids[pending], normals[pending], settings)
-        if visible.any():
-            seen[pending[visible]] = True
-            pending = pending[~visible]
-            if len(pending) == 0:
-                break
+        T, c = frame.T_world_camera.astype(np.float32), frame.camera
+        mark_seen(
+            pending, centroids, normals, np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3]),
+            np.array([c.fx, c.fy, c.cx, c.cy], np.float32), frame.depth, np.float32(c.near),
+            np.float32(settings.cull_tolerance_m), np.float32(settings.cull_facing_cosine), seen,
+        )
+        pending = pending[~seen[pending]]
+        if len(pending) == 0:
+            break
     return keep_faces(mesh, seen)
-
-
-def _sees(frame: Frame, points: np.ndarray, normals: np.ndarray, settings: MeshSettings) -> np.ndarray:
-    """(N,) bool, which points on faces with the given unit normals the frame sees."""
-    uv, z = projection.project(points, frame.T_world_camera, frame.camera)
-    out = projection.in_image(uv, z, frame.camera)
-    at = np.flatnonzero(out)
-    j, i = uv[at].astype(np.int64).T
-    depth = frame.depth[i, j]
-    towards = frame.T_world_camera[:3, 3].astype(np.float32) - points[at]
-    cosine = (normals[at] * towards).sum(axis=1) / np.maximum(np.linalg.norm(towards, axis=1), 1e-9)
-    out[at] = (depth > 0) & (z[at] <= depth + settings.cull_tolerance_m) & (cosine >= settings.cull_facing_cosine)
-    return out

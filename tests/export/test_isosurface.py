@@ -12,7 +12,7 @@ from active3d_pipe.export.isosurface import (
     keep_faces,
     near_surface,
 )
-from active3d_pipe.geometry import se3
+from active3d_pipe.geometry import projection, se3
 from active3d_pipe.structures import Camera, Frame, TriangleMesh, VoxelGrid
 
 CENTRE, RADIUS = np.array([0.03, -0.02, 0.05]), 0.3
@@ -121,6 +121,27 @@ def test_cull_keeps_what_a_frame_saw(ball):
     # A reading in front hides everything.
     blocked = cull_unseen(ball, [frame_of(camera, T, np.where(depth > 0, 0.4, 0))], SETTINGS)
     assert len(blocked.faces) == 0
+
+
+def test_cull_agrees_with_the_slow_formula(ball):
+    rng = np.random.default_rng(0)
+    camera = Camera.from_fov(40, 30, 80)
+    T = se3.look_at(CENTRE + np.array([0.5, 0.6, 0.2]), CENTRE + np.array([0.1, 0, 0.1]))
+    frame = frame_of(camera, T, rng.uniform(0, 1, (30, 40)) * (rng.random((30, 40)) < 0.8))
+    normal, centroid = normals_of(ball)
+    expected = np.zeros(len(ball.faces), bool)
+    for k in range(len(expected)):
+        uv, z = projection.project(centroid[k].astype(np.float64), T, camera)
+        if projection.in_image(uv, z, camera):
+            d = frame.depth[int(uv[1]), int(uv[0])]
+            to_camera = T[:3, 3] - centroid[k]
+            cosine = normal[k] @ to_camera / np.linalg.norm(normal[k]) / np.linalg.norm(to_camera)
+            expected[k] = d > 0 and z <= d + 0.05 and cosine >= 0.2
+    settings = SETTINGS.model_copy(update={"cull_facing_cosine": 0.2})
+    kept = cull_unseen(ball, [frame], settings)
+    assert 100 < expected.sum() < 0.5 * len(expected)
+    # A face exactly on a pixel border may fall either way in float32.
+    assert abs(len(kept.faces) - expected.sum()) <= 2
 
 
 def test_small_pieces_are_dropped():
