@@ -5,6 +5,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 RUNS   ?= data/runs
+NODE   := tests/interop/node
 MARKED := slow or interop or crash
 
 .PHONY: help setup demo test test-slow test-crash interop lint bench clean
@@ -37,7 +38,10 @@ test-slow: $(READY) ## longer tests
 test-crash: $(READY) ## kill -9 at 25 random moments of a real run
 	$(BIN)/python -m pytest -m crash --timeout 3600
 
-interop: $(READY) ## independent readers open what we write (says what it needs)
+interop: $(READY) ## independent readers open what we write; needs Node.js 20 with npm, and Debian's chromium (SwiftShader)
+	@command -v npm >/dev/null || { echo "interop needs Node.js 20 or newer with npm: apt install nodejs npm"; exit 1; }
+	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e '.[interop]'
+	npm ci --silent --no-audit --no-fund --prefix $(NODE)
 	$(BIN)/python -m pytest -m interop --timeout 1800 -rs
 
 lint: $(READY)  ## style, types, import contracts
