@@ -24,7 +24,7 @@ def test_xarray_opens_volumes_with_coordinates_in_metres(tiny_run: Path) -> None
     xarray = importlib.import_module("xarray")
     for path in stores(tiny_run):
         ours = volumes.read_volume(path)
-        with xarray.open_zarr(path, group="scale0") as data:
+        with xarray.open_zarr(path, group="scale0", consolidated=False) as data:
             assert set(data.data_vars) == set(VOLUMES)
             for name in VOLUMES:
                 array = data[name]
@@ -41,7 +41,7 @@ def test_xarray_joins_the_rounds_along_their_axis(tiny_run: Path) -> None:
     need_module("xarray")
     xarray = importlib.import_module("xarray")
     paths = stores(tiny_run)
-    joined = xarray.concat([xarray.open_zarr(p, group="scale0") for p in paths], dim="round")
+    joined = xarray.concat([xarray.open_zarr(p, group="scale0", consolidated=False) for p in paths], dim="round")
     assert joined["u_final"].shape == (len(paths), *volumes.read_volume(paths[0]).grid.shape)
 
 
