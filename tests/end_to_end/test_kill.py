@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.timeout(1800)
+
 VOLATILE = ("logs/", "report/", "journal.jsonl", "run.lock")  # wall-clock times are in these, by design
 
 

@@ -7,10 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from active3d_pipe.storage import capture_log, meshes, splats, volumes
 from active3d_pipe.storage.files import read_json
 
+pytestmark = pytest.mark.timeout(1200)  # the first test makes the run, cold kernels included
 Cli = Callable[..., subprocess.CompletedProcess]
 
 
