@@ -62,6 +62,7 @@ class Runner:
         """Explore to the end and finish; goes on where an earlier call stopped."""
         with RunLock(self.run_dir.path), StopRequest() as stop:
             self._recover()
+            self.surveyor.deep = True
             k = 0
             while True:
                 before = len(self._executed)

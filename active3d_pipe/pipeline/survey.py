@@ -54,6 +54,10 @@ class Surveyor:
         self._lineage = sorted(lineage, key=lambda past: past[0])
         self._subsets: dict[tuple[str, int], dict[str, Any]] = {}
         self._contents: dict[NodeId, tuple[Record, str]] = {}
+        # With `deep`, every byte is hashed once before a node counts as up to date: damage that leaves sizes as
+        # they were is found too, and before anything (a stage's `parameters` hook, say) reads it.
+        self.deep = False
+        self._whole: set[NodeId] = set()
 
     def config_of(self, node: NodeId) -> Any:
         """The configuration that a node is made with: that of its ancestor run for inherited rounds."""
@@ -87,6 +91,7 @@ class Surveyor:
     def forget(self, node: NodeId) -> None:
         """Read the node's record again next time."""
         self._contents.pop(node, None)
+        self._whole.discard(node)
 
     def last_round_on_disk(self) -> int:
         """The highest round of which anything exists, or -1."""
@@ -108,6 +113,11 @@ class Surveyor:
             record = self.record(node)
         except ArtifactError as error:
             return NodeState(node, State.DAMAGED, (str(error),))
+        if record is not None and self.deep and node not in self._whole and not self.store.is_pruned(node):
+            wrong = damage(self.store.folder(node), record, deep=True)
+            if wrong:
+                return NodeState(node, State.DAMAGED, tuple(wrong), record)
+            self._whole.add(node)
         try:
             parts = self.parts(node, last_round)
         except Active3dError as error:

@@ -55,10 +55,10 @@ def named(cli: Cli, run: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("kind", sorted(ARTIFACTS))
-def test_a_shortened_file_is_named_and_made_again(copy: Path, tiny_run: Path, run_cli: Cli, kind: str) -> None:
+def test_a_flipped_bit_is_named_and_made_again(copy: Path, tiny_run: Path, run_cli: Cli, kind: str) -> None:
     name = ARTIFACTS[kind]
     artifact, file = split(name)
-    cut(copy / name)
+    flip(copy / name)
     named(run_cli, copy, name)
     resumed = run_cli("resume", copy)
     assert resumed.returncode == 0, resumed.stderr
@@ -70,9 +70,9 @@ def test_a_shortened_file_is_named_and_made_again(copy: Path, tiny_run: Path, ru
 
 
 @pytest.mark.parametrize("kind", sorted(ARTIFACTS))
-def test_a_flipped_bit_is_named(copy: Path, tiny_run: Path, run_cli: Cli, kind: str) -> None:
+def test_a_shortened_file_is_named(copy: Path, tiny_run: Path, run_cli: Cli, kind: str) -> None:
     name = ARTIFACTS[kind]
-    flip(copy / name)
+    cut(copy / name)
     named(run_cli, copy, name)
     (copy / name).write_bytes((tiny_run / name).read_bytes())
 
