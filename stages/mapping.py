@@ -10,6 +10,8 @@ def _inputs(round: int) -> tuple[NodeId, ...]:
 
 
 def _run(context: StageContext) -> None:
+    import time
+
     import numpy as np
 
     from active3d_pipe.mapping.hybrid_map import HybridMap
@@ -18,6 +20,7 @@ def _run(context: StageContext) -> None:
     from active3d_pipe.storage.files import write_json
 
     config, k = context.config, context.round
+    start = time.perf_counter()
     frames = shared.load_frames(context.input("capture", k))
     if k == 0:
         bounds = np.array(shared.load_rig(context.inputs)["bounds"])
@@ -26,8 +29,11 @@ def _run(context: StageContext) -> None:
     else:
         hybrid = shared.load_map(context.input("mapping", k - 1), context.inputs, config)
         volume = volumes.read_volume(context.input("uncertainty", k - 1) / shared.VOLUME_NAME)
+    context.timings["reading the map"] = time.perf_counter() - start
     report = update_map(hybrid, frames, volume, k, config.mapping, context.rng("updates"), context.progress)
+    start = time.perf_counter()
     shared.save_map(context.out, hybrid)
+    context.timings["writing the map"] = time.perf_counter() - start
     write_json(context.out / "mapping.json", {"schema": "active3d.mapping/1", "round": k, **report.numbers})
     context.timings.update(report.seconds)
     context.notes.update(report.numbers)

@@ -103,8 +103,11 @@ def save_map(folder: Path, hybrid: "HybridMap") -> None:
     write_json(folder / "keyframes.json", [k.to_json() for k in hybrid.keyframes])
 
 
-def load_map(folder: Path, inputs: Mapping[NodeId, Path], config: Any) -> "HybridMap":
-    """Read a map; its keyframes' images come from the capture logs among `inputs`."""
+def load_map(folder: Path, inputs: Mapping[NodeId, Path], config: Any, *, to_train: bool = True) -> "HybridMap":
+    """Read a map; its keyframes' images come from the capture logs among `inputs`.
+
+    Without `to_train` the optimiser's state, two thirds of the bytes, stays on disk.
+    """
     from active3d_pipe.mapping.hybrid_map import HybridMap
     from active3d_pipe.mapping.keyframes import Keyframe
     from active3d_pipe.storage.files import read_json, read_tensors
@@ -114,7 +117,7 @@ def load_map(folder: Path, inputs: Mapping[NodeId, Path], config: Any) -> "Hybri
         frames = load_frames(inputs[NodeId("capture", doc["round"])])
         frame = frames[doc["step"] - frames[0].step]
         keyframes.append(Keyframe(frame, doc["round"], doc["reason"], doc["delta"], doc["gain"], doc["rho"]))
-    names = ("field", "gaussians", "optimiser")
+    names = ("field", "gaussians", "optimiser") if to_train else ("field", "gaussians")
     state = {name: read_tensors(folder / f"{name}.safetensors")[0] for name in names}
     bounds = np.array(load_rig(inputs)["bounds"])
     return HybridMap.from_state(bounds[0], bounds[1], config.mapping, state, keyframes)

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from active3d_pipe.structures import Frame, UncertaintyVolume
     from active3d_pipe.uncertainty.explicit import ViewResidual
 
-EXAMINED = 24  # keyframes whose residuals are looked at in a round
+EXAMINED = 16  # keyframes whose residuals are looked at in a round
 PREDICT_EVERY = 2  # every n-th new frame is predicted by the map of the round before
 RESIDUAL_STRIDE = 2  # residual images have this fraction of the camera's resolution
 
@@ -46,11 +46,13 @@ def _run(context: StageContext) -> None:
     bounds = np.array(shared.load_rig(context.inputs)["bounds"])
     grid = make_grid(bounds[0], bounds[1], config.uncertainty)
     frames = shared.load_frames(context.input("capture", k))
-    hybrid = shared.load_map(context.input("mapping", k), context.inputs, config)
+    start = time.perf_counter()
+    hybrid = shared.load_map(context.input("mapping", k), context.inputs, config, to_train=False)
+    context.timings["reading the map"] = time.perf_counter() - start
     previous, predicted = None, []
     if k > 0:
         previous = volumes.read_volume(context.input("uncertainty", k - 1) / shared.VOLUME_NAME)
-        before = shared.load_map(context.input("mapping", k - 1), context.inputs, config)
+        before = shared.load_map(context.input("mapping", k - 1), context.inputs, config, to_train=False)
         predicted = _residuals(before, frames[::PREDICT_EVERY], context.timings)
     examined = shared.spread(hybrid.keyframes, EXAMINED)
     views = _residuals(hybrid, [key.frame for key in examined], context.timings)

@@ -31,5 +31,5 @@ class ExportSettings(Settings):
     mesh: MeshSettings = Field(default_factory=MeshSettings, description="the coloured mesh")
     glb: bool = Field(True, description="write the mesh as GLB beside PLY")
     preview_voxel_m: float = Field(
-        0.05, gt=0, description="cell edge of the coarse surface written every round (curves, looking at progress), m"
+        0.08, gt=0, description="cell edge of the coarse surface written every round (curves, looking at progress), m"
     )

@@ -41,6 +41,13 @@ class GaussianParameters:
         zeros = torch.zeros_like(values)
         return cls(values, zeros, zeros.clone(), torch.zeros(len(values), dtype=torch.int32))
 
+    @classmethod
+    def from_values(cls, values: np.ndarray) -> "GaussianParameters":
+        """Parameters with a copy of `values` (N, 14) float32; moments and steps start at zero."""
+        zeros = np.zeros(values.shape, np.float32)
+        steps = np.zeros(len(values), np.int32)
+        return cls.from_state({"values": values, "moment1": zeros, "moment2": zeros, "steps": steps})
+
     def to_model(self) -> GaussianModel:
         """A copy as plain arrays."""
         v = self.values.detach().numpy()

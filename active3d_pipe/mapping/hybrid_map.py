@@ -60,14 +60,17 @@ class HybridMap:
         cls, low: np.ndarray, high: np.ndarray, settings: MappingSettings, state: dict[str, dict[str, np.ndarray]],
         keyframes: Sequence[Keyframe],
     ) -> "HybridMap":
-        """Inverse of `state`, exact."""
+        """Inverse of `state`, exact. Without the table `optimiser` the map can be looked at, not trained further."""
         hybrid = cls.create(low, high, settings, np.random.default_rng(0))
         hybrid.field.load_state(state["field"])
+        hybrid.keyframes = list(keyframes)
+        if "optimiser" not in state:
+            hybrid.gaussians = GaussianParameters.from_values(state["gaussians"]["values"])
+            return hybrid
         tables: dict[str, dict[str, np.ndarray]] = {p: {} for p in OPTIMISER_PREFIXES}
         for name, array in state["optimiser"].items():
             prefix = next(p for p in OPTIMISER_PREFIXES if name.startswith(p))
             tables[prefix][name.removeprefix(prefix)] = array
         hybrid.optimiser.load_state(tables["field."])
         hybrid.gaussians = GaussianParameters.from_state({**state["gaussians"], **tables["gaussians."]})
-        hybrid.keyframes = list(keyframes)
         return hybrid
