@@ -36,4 +36,4 @@ for await (const message of reader.readMessages()) {
 const metadata = {};
 for await (const record of reader.readMetadata()) metadata[record.name] = Object.fromEntries(record.metadata);
 await handle.close();
-process.stdout.write(JSON.stringify({ library: reader.header.library, topics, metadata }));
+process.stdout.write(JSON.stringify({ library: reader.header["library"], topics, metadata }));
