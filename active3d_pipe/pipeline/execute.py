@@ -35,7 +35,7 @@ class Executor:
 
     def execute(self, node: NodeId, last_round: int, why: str) -> Record:
         """Run a node on the inputs that are on disk, commit, and return the new record."""
-        inputs = self.registry.inputs(node, last_round)
+        inputs = self.surveyor.inputs(node, last_round)
         before = self._readable_record(node)
         self.provide(inputs, last_round)
         self.watcher.began(node, why)
@@ -69,7 +69,7 @@ class Executor:
                 self._trusted.add(node)
                 continue
             needed[node] = why
-            queue += self.registry.inputs(node, last_round)
+            queue += self.surveyor.inputs(node, last_round)
         for node in sorted(needed, key=self.registry.rank):
             self._rebuild(node, last_round, needed[node])
         return len(needed)
@@ -146,7 +146,7 @@ class Executor:
         return aside, context
 
     def _context(self, stage: Stage, node: NodeId, parts: dict[str, Any], last_round: int, out: Path) -> StageContext:
-        inputs = {name: self.store.folder(name) for name in self.registry.inputs(node, last_round)}
+        inputs = {name: self.store.folder(name) for name in self.surveyor.inputs(node, last_round)}
         seconds: dict[NodeId, dict[str, float]] = {}
         if node.round is None:
             seconds = {name: {"total": s.seconds, **s.timings} for name, s in self.journal.spent().items()}

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 from active3d_pipe.errors import ConfigError
 from active3d_pipe.pipeline.nearest import did_you_mean
@@ -47,6 +48,8 @@ class Registry:
             yield from self.round_nodes(k)
         yield from self.finish_nodes()
 
-    def inputs(self, node: NodeId, last_round: int) -> tuple[NodeId, ...]:
-        """The nodes that `node` reads."""
-        return self.stage(node.stage).inputs(last_round if node.round is None else node.round)
+    def inputs(self, node: NodeId, last_round: int, config: Any) -> tuple[NodeId, ...]:
+        """The nodes that `node` reads when it is made with `config`."""
+        stage, k = self.stage(node.stage), last_round if node.round is None else node.round
+        extra = () if stage.extra_inputs is None else stage.extra_inputs(config, k)
+        return (*stage.inputs(k), *extra)

@@ -109,7 +109,7 @@ class Runner:
         nodes, last = self._selection(name, round, until)
         plan: list[NodeState] = []
         for node in nodes:
-            waiting = [s.node for s in plan if not s.state.is_hit and s.node in self.registry.inputs(node, last)]
+            waiting = [s.node for s in plan if not s.state.is_hit and s.node in self.surveyor.inputs(node, last)]
             state = self.surveyor.assess(node, last)
             if waiting:
                 state = NodeState(node, State.STALE, (f"follows {waiting[0]}",), state.record)
@@ -239,7 +239,7 @@ class Runner:
                     f"--round {last}: the run has rounds 0 to {self.surveyor.last_round_on_disk()}"
                 )
         nodes = [NodeId(n, last if self.registry.stage(n).loop else None) for n in chosen]
-        for wanted in self.registry.inputs(nodes[0], last):
+        for wanted in self.surveyor.inputs(nodes[0], last):
             if not self.run_dir.store.folder(wanted).exists():
                 raise ArtifactError(
                     f"{nodes[0]} needs {wanted}, which is not made yet; `active3d resume {self.run_dir.path}` makes it"
@@ -251,13 +251,13 @@ class Runner:
         last = self.last_round()
         has: Callable[[NodeId], bool] = lambda node: self._record(node) is not None  # noqa: E731
         for k in range(last, -1, -1):
-            if all(has(node) for node in self.registry.inputs(NodeId(name, k), k)):
+            if all(has(node) for node in self.surveyor.inputs(NodeId(name, k), k)):
                 return k
         return 0
 
     def _warn_of_stale_inputs(self, nodes: list[NodeId], last: int) -> None:
         states = self.surveyor.survey(last)
-        inputs = self.registry.inputs(nodes[0], last)
+        inputs = self.surveyor.inputs(nodes[0], last)
         stale = [states[name] for name in inputs if name in states and states[name].state is State.STALE]
         # The one with a reason of its own tells more than those that merely follow.
         stale.sort(key=lambda state: state.reasons[0].startswith("follows "))

@@ -79,6 +79,8 @@ class Stage:
         loop: True for the stages of a round, False for the finishing ones.
         parameters: values derived from the whole configuration and the input folders that enter the key
             (digest of the scene file, effective step limit); called before `run` and before a key is known.
+        extra_inputs: further nodes that it reads, given the configuration and its round; they enter the key like the
+            others.
         volatile: True when the output holds wall-clock times and so differs between equal runs.
     """
 
@@ -90,3 +92,4 @@ class Stage:
     loop: bool
     parameters: Callable[[Any, Mapping[NodeId, Path]], dict[str, Any]] | None = None
     volatile: bool = False
+    extra_inputs: Callable[[Any, int], tuple[NodeId, ...]] | None = None

@@ -67,6 +67,10 @@ class Surveyor:
                     return config
         return self._config
 
+    def inputs(self, node: NodeId, last_round: int) -> tuple[NodeId, ...]:
+        """The nodes that `node` reads with the configuration that it is made with."""
+        return self.registry.inputs(node, last_round, self.config_of(node))
+
     @property
     def inherited_rounds(self) -> int:
         """Number of leading rounds that come from another run."""
@@ -100,7 +104,7 @@ class Surveyor:
     def parts(self, node: NodeId, last_round: int) -> dict[str, Any]:
         """The parts of a node's key, its inputs taken as they are on disk."""
         stage, config = self.registry.stage(node.stage), self.config_of(node)
-        inputs = self.registry.inputs(node, last_round)
+        inputs = self.inputs(node, last_round)
         contents = {name: self.content(name) for name in inputs}
         return key_parts(
             stage, node_seed(config.run.seed, node), config.run.threads, self._subset(stage, config),
@@ -139,7 +143,7 @@ class Surveyor:
         """
         found: dict[NodeId, NodeState] = {}
         for node in self.registry.nodes(last_round):
-            waiting = [name for name in self.registry.inputs(node, last_round) if not _is_hit(found, name)]
+            waiting = [name for name in self.inputs(node, last_round) if not _is_hit(found, name)]
             if waiting:
                 found[node] = self._follower(node, waiting[0])
             else:
