@@ -18,11 +18,13 @@ def _inputs(round: int) -> tuple[NodeId, ...]:
 
 
 def _parameters(config: Any, inputs: Mapping[NodeId, Path]) -> dict[str, Any]:
-    """The scene's digest, and how many steps this round may take: the budget enters the key only where it binds."""
-    from active3d_pipe.sim.digest import source_digest
+    """The scene's name and digest, and how many steps this round may take: the budget enters the key only where it binds."""
+    from active3d_pipe.sim.digest import scene_name, source_digest
     from active3d_pipe.storage.files import read_json
 
-    values: dict[str, Any] = {"scene": source_digest(config.scene.file)}
+    values: dict[str, Any] = {
+        "scene": source_digest(config.scene.file), "scene_name": scene_name(Path(config.scene.file)),
+    }
     done = planned = 0
     for node, folder in inputs.items():
         if node.stage == "capture":
@@ -83,8 +85,8 @@ def _run(context: StageContext) -> None:
 
 
 STAGE = Stage(
-    name="capture", version=1,
+    name="capture", version=2,
     config=("scene", "camera", "sensor", "motion", "planning.bootstrap_turn_deg", "planning.bootstrap_pitch_deg",
         "run.seed",),
-    inputs=_inputs, run=_run, loop=True, parameters=_parameters,
+    inputs=_inputs, run=_run, loop=True, parameters=_parameters, unkeyed=("scene.file",),
 )

@@ -20,9 +20,10 @@ def _inputs(last_round: int) -> tuple[NodeId, ...]:
 
 
 def _parameters(config: Any, inputs: Mapping[NodeId, Path]) -> dict[str, Any]:
-    from active3d_pipe.sim.digest import source_digest
+    from active3d_pipe.sim.digest import scene_name, source_digest
 
-    return {"scene": source_digest(config.scene.file)}
+    # The name seeds the held-out views.
+    return {"scene": source_digest(config.scene.file), "scene_name": scene_name(Path(config.scene.file))}
 
 
 def _run(context: StageContext) -> None:
@@ -155,4 +156,5 @@ def _write_examples(folder: Path, render: Any, sets: dict, scores: "dict[str, Vi
 STAGE = Stage(
     name="evaluation", version=1, config=("evaluation", "scene", "camera", "sensor", "mapping", "run.seed"),
     inputs=_inputs, run=_run, loop=False, parameters=_parameters,
+    unkeyed=("scene.file",),
 )

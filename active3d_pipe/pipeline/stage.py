@@ -81,6 +81,8 @@ class Stage:
             (digest of the scene file, effective step limit); called before `run` and before a key is known.
         extra_inputs: further nodes that it reads, given the configuration and its round; they enter the key like the
             others.
+        unkeyed: dotted settings of those sections that enter the key only through `parameters` (of a file's path, what
+            matters is the digest of the file).
         volatile: True when the output holds wall-clock times and so differs between equal runs.
     """
 
@@ -92,4 +94,5 @@ class Stage:
     loop: bool
     parameters: Callable[[Any, Mapping[NodeId, Path]], dict[str, Any]] | None = None
     volatile: bool = False
+    unkeyed: tuple[str, ...] = ()
     extra_inputs: Callable[[Any, int], tuple[NodeId, ...]] | None = None

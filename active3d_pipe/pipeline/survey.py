@@ -161,7 +161,7 @@ class Surveyor:
     def _subset(self, stage: Stage, config: Any) -> dict[str, Any]:
         name = (stage.name, id(config))
         if name not in self._subsets:
-            self._subsets[name] = subset(config, stage.config)
+            self._subsets[name] = subset(config, stage.config, stage.unkeyed)
         return self._subsets[name]
 
     def _parameters(

@@ -39,8 +39,11 @@ class ConfigView:
         raise UndeclaredConfigError(f"stage {self._stage.name!r} tries to change the configuration's {name!r}")
 
 
-def subset(config: BaseModel, sections: tuple[str, ...]) -> dict[str, Any]:
-    """Dotted section -> its values as plain JSON; a section that does not exist is a mistake in the stage."""
+def subset(config: BaseModel, sections: tuple[str, ...], unkeyed: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Dotted section -> its values as plain JSON, without the settings `unkeyed` (dotted).
+
+    A section or setting that does not exist is a mistake in the stage.
+    """
     found: dict[str, Any] = {}
     for section in sorted(sections):
         value: Any = config
@@ -49,6 +52,11 @@ def subset(config: BaseModel, sections: tuple[str, ...]) -> dict[str, Any]:
                 raise UndeclaredConfigError(f"the configuration has no section {section!r}")
             value = getattr(value, name)
         found[section] = value.model_dump(mode="json") if isinstance(value, BaseModel) else _plain(value)
+    for path in unkeyed:
+        section, _, name = path.rpartition(".")
+        if name not in found.get(section, {}):
+            raise UndeclaredConfigError(f"the configuration's {path!r} is in none of the stage's sections")
+        del found[section][name]
     return found
 
 

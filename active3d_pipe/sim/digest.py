@@ -10,6 +10,12 @@ SIDECARS = {".obj": (".mtl", ".png", ".jpg", ".jpeg"), ".gltf": (".bin", ".png",
 _known: dict[tuple, str] = {}
 
 
+def scene_name(path: Path) -> str:
+    """Name of a scene by its file: the folder's name for `<name>/scene.glb`, else the file's stem."""
+    stem = path.stem
+    return path.resolve().parent.name if stem in ("scene", "mesh", "mesh_semantic") else stem
+
+
 def source_digest(file: str) -> str:
     """sha256 over the scene file, the `scene.json` beside it, and the files that an OBJ or glTF refers to.
 

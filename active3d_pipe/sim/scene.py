@@ -12,7 +12,7 @@ from active3d_pipe.errors import InputError
 from active3d_pipe.geometry.raycasting import SurfaceIndex
 from active3d_pipe.sim import placement, readers
 from active3d_pipe.sim.config import SceneSettings
-from active3d_pipe.sim.digest import source_digest
+from active3d_pipe.sim.digest import scene_name, source_digest
 from active3d_pipe.sim.materials import Material
 from active3d_pipe.structures import check_pose
 
@@ -98,12 +98,6 @@ def load_scene(settings: SceneSettings) -> Scene:
         floor_z=floor_z, source_digest=source_digest(str(path)), up_axis=up_axis, unit_scale=float(scale),
         warnings=(*soup.warnings, *notes),
     )
-
-
-def scene_name(path: Path) -> str:
-    """Name of a scene by its file: the folder's name for `<name>/scene.glb`, else the file's stem."""
-    stem = path.stem
-    return path.resolve().parent.name if stem in ("scene", "mesh", "mesh_semantic") else stem
 
 
 def _start_pose(

@@ -4,24 +4,25 @@ Foxglove protobuf schemas, so that Rerun, Foxglove, and any MCAP reader with the
 Times are simulated, never wall clock: equal runs give equal bytes.
 """
 
-import io
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from active3d_pipe import __version__
 from active3d_pipe.errors import ArtifactError
 from active3d_pipe.geometry import se3
 from active3d_pipe.storage.files import reading, writing
+from active3d_pipe.storage.png import decode_png, encode_png
 from active3d_pipe.structures import Camera, Frame
 
 COLOR, DEPTH, CALIBRATION = "/camera/color/image", "/camera/depth/image", "/camera/color/calibration"
 DEPTH_CALIBRATION, TRANSFORMS, POSE, PATH = "/camera/depth/calibration", "/tf", "/camera/pose", "/plan/path"
 WORLD, OPTICAL = "world", "camera_optical"
 STEP_NS = 100_000_000  # simulated duration of a step
+_THREADS = 2  # for compression, which lets other threads run; the bytes do not depend on it
 
 
 def write_frames(path: Path, frames: Sequence[Frame], planned_path: np.ndarray) -> None:
@@ -39,7 +40,8 @@ def write_frames(path: Path, frames: Sequence[Frame], planned_path: np.ndarray) 
         COLOR: CompressedImage, DEPTH: RawImage, CALIBRATION: CameraCalibration, DEPTH_CALIBRATION: CameraCalibration,
         TRANSFORMS: FrameTransforms, POSE: PoseInFrame, PATH: PosesInFrame,
     }
-    with writing(path), path.open("wb") as stream:
+    with writing(path), path.open("wb") as stream, ThreadPoolExecutor(_THREADS) as pool:
+        images = pool.map(encode_png, [frame.rgb for frame in frames])  # in order, ahead of the chunks' compression
         writer = Writer(stream, compression=CompressionType.ZSTD, enable_crcs=True)
         # Set by ourselves: the default names the library's version, and an upgrade would change the bytes.
         writer.start(profile="", library=f"active3d/{__version__}")
@@ -50,10 +52,10 @@ def write_frames(path: Path, frames: Sequence[Frame], planned_path: np.ndarray) 
             data = message.SerializeToString(deterministic=True)
             writer.add_message(channels[topic], frame.stamp_ns, data, frame.stamp_ns, sequence=frame.step)
 
-        for i, frame in enumerate(frames):
+        for i, (frame, image) in enumerate(zip(frames, images, strict=True)):
             if i == 0:
                 add(PATH, _path_message(PosesInFrame(), frame, planned_path), frame)
-            add(COLOR, _color_message(CompressedImage(), frame), frame)
+            add(COLOR, _color_message(CompressedImage(), frame, image), frame)
             add(DEPTH, _depth_message(RawImage(), frame), frame)
             add(CALIBRATION, _calibration_message(CameraCalibration(), frame), frame)
             add(DEPTH_CALIBRATION, _calibration_message(CameraCalibration(), frame), frame)
@@ -83,20 +85,24 @@ def read_frames(path: Path) -> list[Frame]:
             stamps[record.sequence] = record.log_time
         ranges = next((dict(m.metadata) for m in reader.iter_metadata() if m.name == "active3d"), {})
         near, far = (float(x) for x in ranges.get("camera", "0.05 10").split())
-        frames = []
-        for step in sorted(messages):
-            found = messages[step]
-            if set(found) != set(types):
-                raise ArtifactError(f"{path}: step {step} has {sorted(found)}, expected {sorted(types)}")
-            frames.append(_frame(step, stamps[step], found, near, far))
-        return frames
+        steps = sorted(messages)
+        for step in steps:
+            if set(messages[step]) != set(types):
+                raise ArtifactError(f"{path}: step {step} has {sorted(messages[step])}, expected {sorted(types)}")
+        with ThreadPoolExecutor(_THREADS) as pool:
+            images = pool.map(decode_png, [messages[step][COLOR].data for step in steps])
+            return [
+                _frame(step, stamps[step], messages[step], image, near, far)
+                for step, image in zip(steps, images, strict=True)
+            ]
 
 
-def _frame(step: int, stamp_ns: int, found: dict, near: float, far: float) -> Frame:
+def _frame(step: int, stamp_ns: int, found: dict, rgb: np.ndarray, near: float, far: float) -> Frame:
     calibration, depth_message = found[CALIBRATION], found[DEPTH]
     K = calibration.K
     camera = Camera(calibration.width, calibration.height, K[0], K[4], K[2], K[5], near, far)
-    rgb = np.asarray(Image.open(io.BytesIO(found[COLOR].data)).convert("RGB"))
+    if rgb.shape != (camera.height, camera.width, 3):
+        raise ArtifactError(f"step {step}: image of shape {rgb.shape} for a camera of {camera.width}x{camera.height}")
     depth = np.frombuffer(depth_message.data, "<f4").reshape(camera.height, camera.width).astype(np.float32)
     pose = found[POSE].pose
     T = np.eye(4)
@@ -128,11 +134,9 @@ def _set_pose(pose: Any, T: np.ndarray) -> None:
     orientation.w, orientation.x, orientation.y, orientation.z = (float(v) for v in q)
 
 
-def _color_message(message: Any, frame: Frame) -> Any:
+def _color_message(message: Any, frame: Frame, image: bytes) -> Any:
     _stamp(message, frame, OPTICAL)
-    buffer = io.BytesIO()
-    Image.fromarray(frame.rgb).save(buffer, "PNG", compress_level=1)
-    message.data, message.format = buffer.getvalue(), "png"
+    message.data, message.format = image, "png"
     return message
 
 

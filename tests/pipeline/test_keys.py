@@ -8,13 +8,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from active3d_pipe.pipeline.config import Config
+from active3d_pipe.pipeline.config import Config, load_config
 from active3d_pipe.pipeline.config_errors import leaves, section_of
 from active3d_pipe.pipeline.graph import Registry
 from active3d_pipe.pipeline.keys import canonical, differences, digest, node_seed
 from active3d_pipe.pipeline.stage import NodeId
 from active3d_pipe.pipeline.threads import set_threads
-from active3d_pipe.pipeline.view import subset
+from active3d_pipe.pipeline.view import UndeclaredConfigError, subset
 from tests.pipeline.conftest import open_runner
 from tests.pipeline.toy import REGISTRY
 
@@ -84,17 +84,41 @@ def _real_registry() -> Registry:
 @pytest.mark.parametrize("registry", [lambda: REGISTRY, _real_registry], ids=["toy", "real"])
 def test_every_setting_enters_the_keys_of_exactly_the_stages_that_declare_it(registry: Any) -> None:
     config, stages = Config(), registry().stages
-    before = {stage.name: canonical(subset(config, stage.config)) for stage in stages}
+    before = {stage.name: canonical(subset(config, stage.config, stage.unkeyed)) for stage in stages}
     paths = [path for path in leaves(Config) if _is_leaf(path)]
     assert len(paths) > 50
     for path in paths:
         changed = _changed(config, path)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            after = {stage.name: canonical(subset(changed, stage.config)) for stage in stages}
+            after = {stage.name: canonical(subset(changed, stage.config, stage.unkeyed)) for stage in stages}
         differ = {name for name in before if before[name] != after[name]}
-        declare = {s.name for s in stages if any(path == c or path.startswith(f"{c}.") for c in s.config)}
+        declare = {
+            s.name for s in stages
+            if path not in s.unkeyed and any(path == c or path.startswith(f"{c}.") for c in s.config)
+        }
         assert differ == declare, path
+
+
+def test_a_moved_scene_keeps_its_key_and_a_changed_or_renamed_one_does_not(tmp_path: Path) -> None:
+    stage = next(s for s in _real_registry().stages if s.name == "capture")
+
+    def key(folder: Path, content: bytes) -> str:
+        folder.mkdir(parents=True)
+        (folder / "scene.glb").write_bytes(content)
+        config = load_config(None, (f"scene.file={folder / 'scene.glb'}",), environ={})
+        assert stage.parameters is not None
+        return digest([subset(config, stage.config, stage.unkeyed), stage.parameters(config, {})])
+
+    first = key(tmp_path / "here" / "flat", b"a")
+    assert key(tmp_path / "there" / "flat", b"a") == first
+    assert key(tmp_path / "elsewhere" / "flat", b"b") != first
+    assert key(tmp_path / "there" / "house", b"a") != first
+
+
+def test_an_unkeyed_setting_must_be_declared() -> None:
+    with pytest.raises(UndeclaredConfigError, match=r"scene\.file"):
+        subset(Config(), ("camera",), ("scene.file",))
 
 
 def _is_leaf(path: str) -> bool:
