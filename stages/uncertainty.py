@@ -10,11 +10,8 @@ from stages import shared
 if TYPE_CHECKING:
     from active3d_pipe.mapping.hybrid_map import HybridMap
     from active3d_pipe.structures import Frame, UncertaintyVolume
+    from active3d_pipe.uncertainty.config import UncertaintySettings
     from active3d_pipe.uncertainty.explicit import ViewResidual
-
-EXAMINED = 16  # keyframes whose residuals are looked at in a round
-PREDICT_EVERY = 2  # every n-th new frame is predicted by the map of the round before
-RESIDUAL_STRIDE = 2  # residual images have this fraction of the camera's resolution
 
 
 def _inputs(round: int) -> tuple[NodeId, ...]:
@@ -22,18 +19,34 @@ def _inputs(round: int) -> tuple[NodeId, ...]:
     return (*shared.captures(round), NodeId("mapping", round), *before)
 
 
-def _residuals(hybrid: "HybridMap", frames: "Sequence[Frame]", timings: dict[str, float]) -> "list[ViewResidual]":
-    """Errors of the map's renderings at the frames' poses, at a reduced resolution."""
+def _residuals(
+    hybrid: "HybridMap", frames: "Sequence[Frame]", stride: int, timings: dict[str, float], *, of_field: bool = False
+) -> "list[ViewResidual]":
+    """Errors of the map's renderings at the frames' poses, every `stride`-th pixel; the field's beside, if asked."""
     from active3d_pipe.uncertainty.explicit import view_residuals
 
     start = time.perf_counter()
-    out = []
+    out, query = [], hybrid.field.query_sdf if of_field else None
     for frame in frames:
-        rgb, depth, camera = shared.thinned(frame, RESIDUAL_STRIDE)
+        rgb, depth, camera = shared.thinned(frame, stride)
         view = hybrid.render(camera, frame.T_world_camera)
-        out.append(view_residuals(view.rgb, view.depth, view.alpha, rgb, depth, camera, frame.T_world_camera))
+        out.append(view_residuals(view.rgb, view.depth, view.alpha, rgb, depth, camera, frame.T_world_camera, query))
     timings["residuals"] = timings.get("residuals", 0.0) + time.perf_counter() - start
     return out
+
+
+def _examined(
+    hybrid: "HybridMap", frames: "Sequence[Frame]", previous: "UncertaintyVolume | None",
+    settings: "UncertaintySettings",
+) -> "list[Frame]":
+    """Frames to render with this round's map: some of the new ones, and C_high of the keyframes before them."""
+    from active3d_pipe.uncertainty.explicit import most_uncertain
+
+    chosen = list(frames[::settings.render_every])
+    if previous is not None:
+        older = [key.frame for key in hybrid.keyframes if key.frame.step < frames[0].step]
+        chosen += [older[i] for i in most_uncertain(previous.grid, older, previous["u_exp"], settings)]
+    return chosen
 
 
 def _run(context: StageContext) -> None:
@@ -53,9 +66,10 @@ def _run(context: StageContext) -> None:
     if k > 0:
         previous = volumes.read_volume(context.input("uncertainty", k - 1) / shared.VOLUME_NAME)
         before = shared.load_map(context.input("mapping", k - 1), context.inputs, config, to_train=False)
-        predicted = _residuals(before, frames[::PREDICT_EVERY], context.timings)
-    examined = shared.spread(hybrid.keyframes, EXAMINED)
-    views = _residuals(hybrid, [key.frame for key in examined], context.timings)
+        ahead = frames[:: config.uncertainty.predict_every]
+        predicted = _residuals(before, ahead, config.uncertainty.render_stride, context.timings, of_field=True)
+    examined = _examined(hybrid, frames, previous, config.uncertainty)
+    views = _residuals(hybrid, examined, config.uncertainty.render_stride, context.timings)
     start = time.perf_counter()
     volume = compute_volume(
         grid=grid, round=k, previous=previous, field_query=hybrid.field.query_geometry,
@@ -90,6 +104,6 @@ def _write_surface(context: StageContext, hybrid: "HybridMap", volume: "Uncertai
 
 
 STAGE = Stage(
-    name="uncertainty", version=1, config=("uncertainty", "mapping", "export.preview_voxel_m"),
+    name="uncertainty", version=2, config=("uncertainty", "mapping", "export.preview_voxel_m"),
     inputs=_inputs, run=_run, loop=True,
 )

@@ -13,6 +13,7 @@ import numpy as np
 from active3d_pipe.errors import ArtifactError
 from active3d_pipe.storage.files import reading, writing
 from active3d_pipe.structures import VOLUMES, UncertaintyVolume, VoxelGrid
+from active3d_pipe.structures.uncertainty_volume import ZERO_BY_DEFAULT
 
 GROUP = "scale0"
 MAX_VOXELS = 2**31
@@ -57,6 +58,8 @@ def read_volume(path: Path) -> UncertaintyVolume:
             raise ArtifactError(f"{path}: grid {grid.shape} is larger than any that active3d writes")
         arrays = {}
         for name in VOLUMES:
+            if name in ZERO_BY_DEFAULT and name not in group:
+                continue  # written before there was such a layer
             array = group[name]
             if array.shape != (1, *grid.shape):
                 raise ArtifactError(f"{path}: {name} has shape {array.shape}, expected {(1, *grid.shape)}")

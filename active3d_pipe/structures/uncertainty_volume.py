@@ -21,7 +21,10 @@ VOLUMES: dict[str, tuple[str, str]] = {
     "free_evidence": ("1", "number of depth rays that passed through the voxel"),
     "hit_evidence": ("1", "number of depth rays that ended in the voxel"),
     "view_quality": ("1", "best observation of the voxel's surface so far, 0 = unseen, 1 = close and frontal"),
+    "vain_looks": ("1", "rounds in which rays through the voxel came back without a reading, and no other rays went"),
 }
+# Layers that a producer may leave out: nothing happened there.
+ZERO_BY_DEFAULT = ("vain_looks",)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,6 +45,9 @@ class UncertaintyVolume:
     fusion: dict = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        for name in ZERO_BY_DEFAULT:
+            if name not in self.arrays:
+                object.__setattr__(self, "arrays", {**self.arrays, name: np.zeros(self.grid.shape, np.float32)})
         for name in VOLUMES:
             a = self.arrays.get(name)
             if a is None or a.shape != self.grid.shape or a.dtype != np.float32:

@@ -61,6 +61,30 @@ def integrate_depth(grid: VoxelGrid, frames: Sequence[Frame], settings: Uncertai
     return RayEvidence(free.sum(0).astype(np.float32), hit.sum(0).astype(np.float32), quality.max(0))
 
 
+def looks_in_vain(
+    grid: VoxelGrid, frames: Sequence[Frame], solid: np.ndarray, settings: UncertaintySettings
+) -> np.ndarray:
+    """1 where rays without a reading went in some frame and no ray with one did; float32 [X, Y, Z].
+
+    Windows, mirrors, black or far-away surfaces give no depth however often one looks. A lost ray counts up to
+    `vain_range_m` and up to the first voxel of `solid` (bool); sensor dropout beside readings does not count, since
+    its neighbours cross the same voxels.
+    """
+    s = settings.ray_stride
+    vain, stamp = np.zeros(grid.shape, np.uint8), np.full(grid.shape, -1, np.int32)
+    blocked = np.ascontiguousarray(solid, np.uint8)
+    for n, f in enumerate(frames):
+        start = (f.step // s % s, f.step % s)
+        if ((depth := f.depth[start[0] :: s, start[1] :: s]) >= f.camera.near).sum() == depth.size:
+            continue
+        kernels.mark_vain(
+            f.depth, tuple(intrinsics([f.camera])[0]), f.T_world_camera[:3].astype(np.float64),
+            (f.camera.near, f.camera.far), start, s, grid.origin, 1 / grid.voxel_size, settings.vain_range_m,
+            blocked, stamp, n, vain,
+        )
+    return vain.astype(np.float32)
+
+
 def by_image_size(items: Sequence) -> Iterator[list]:
     """Groups of frames or views whose images share one size, in order of first appearance."""
     groups: dict[tuple[int, int], list] = {}

@@ -31,14 +31,32 @@ class UncertaintySettings(Settings):
     reference_footprint_m: float = Field(
         0.005, gt=0, description="width of a pixel on the surface at which an observation counts as close, m"
     )
+    vain_range_m: float = Field(
+        2.0, gt=0, description="a ray without a reading is a look in vain at voxels up to this depth, m"
+    )
+    vain_keep: float = Field(
+        0.5, ge=0, le=1, description="share of a voxel's unseen uncertainty that a round of looks in vain leaves"
+    )
 
     # Implicit term
-    sigma_scale_m: float = Field(0.1, gt=0, description="field sigma at which u_imp reaches 63 percent, m")
+    sigma_scale_m: float = Field(0.5, gt=0, description="field sigma at which u_imp reaches 63 percent, m")
+    surface_rays: float = Field(
+        5.0, gt=0, description="number of rays that end in a voxel after which its surface is known to 63 percent"
+    )
     sigma_floor_m: float = Field(0.01, gt=0, description="least field sigma believed for occupancy, m")
 
     # Explicit term
-    top_k_views: int = Field(8, ge=1, description="size of C_high: most uncertain views that form u_exp")
-    residual_stride: int = Field(2, ge=1, description="every n-th pixel of a residual image is back-projected")
+    top_k_views: int = Field(3, ge=0, description="size of C_high: most uncertain keyframes that are rendered again")
+    render_every: int = Field(3, ge=1, description="every n-th new frame is rendered with the map of its round")
+    predict_every: int = Field(4, ge=1, description="every n-th new frame is predicted by the map of the round before")
+    render_stride: int = Field(4, ge=1, description="those renderings have this fraction of the camera's resolution")
+    residual_blur_voxels: float = Field(
+        0.7, ge=0, description="standard deviation of the neighbourhood over which residuals are averaged, voxels"
+    )
+    residual_memory: float = Field(
+        1.0, ge=0, description="number of views that the u_exp of the last round counts for in the running mean"
+    )
+    residual_stride: int = Field(1, ge=1, description="every n-th pixel of a residual image is back-projected")
     depth_residual_scale_m: float = Field(0.05, gt=0, description="depth error that counts as 63 percent, m")
     color_residual_scale: float = Field(
         0.3, gt=0, description="colour error, summed over R, G, B in 0..1, that counts as 63 percent"
@@ -53,12 +71,12 @@ class UncertaintySettings(Settings):
     tau_n_m: float = Field(0.03, gt=0, description="tau_n: SDF rise that makes a surface new, m")
     tau_c_m: float = Field(0.05, gt=0, description="tau_c: SDF change of either sign that is a change, m")
     tau_f_m: float = Field(0.03, gt=0, description="tau_f: SDF beyond which space is free, or was solid, m")
-    temporal_decay: float = Field(0.5, ge=0, lt=1, description="share of u_time kept a round when nothing changes")
+    temporal_decay: float = Field(0.8, ge=0, lt=1, description="share of u_time kept a round when nothing changes")
 
     # Fusion and entropy
     terms: tuple[Term, ...] = Field(("imp", "exp", "time"), min_length=1, description="terms that enter u_final")
     fusion: Literal["evidence", "equal"] = Field("evidence", description="alphas by evidence maximisation, or equal")
-    forgetting: float = Field(0.95, gt=0, le=1, description="share of the fusion statistics kept a round")
+    forgetting: float = Field(0.8, gt=0, le=1, description="share of the fusion statistics kept a round")
     fusion_min_rows: int = Field(200, ge=4, description="rows needed before the alphas leave equal weights")
     lambda_imp: float = Field(0.5, ge=0, le=1, description="lambda_imp: weight of the field's entropy")
     lambda_exp: float = Field(0.5, ge=0, le=1, description="lambda_exp: weight of the observed entropy")

@@ -1,19 +1,28 @@
 """View-dependent local uncertainty: residuals of the Gaussian branch, back-projected (eq. view_uncertainty)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from active3d_pipe.errors import InputError
-from active3d_pipe.structures import Camera, VoxelGrid
+from active3d_pipe.geometry import projection, se3
+from active3d_pipe.structures import Camera, Frame, VoxelGrid
 from active3d_pipe.structures.frame import check_pose
 from active3d_pipe.uncertainty import kernels
 from active3d_pipe.uncertainty.carving import by_image_size, intrinsics
 from active3d_pipe.uncertainty.config import UncertaintySettings
 
+QuerySdf = Callable[[np.ndarray], np.ndarray]
+
 # A voxel counts as seen by a view from this much of one pixel's trilinear weight; less is a splash at its border.
 MIN_WEIGHT = 0.25
+# A neighbourhood counts as seen from this many views (a view beside the voxel counts by the blur's weight).
+MIN_VIEWS = 0.01
+# px between the depth samples that tell where a frame looks
+CHOICE_STRIDE = 24
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,6 +35,8 @@ class ViewResidual:
         depth: (H, W) float32 observed depth, m, 0 where the pixel is invalid (mask M_t).
         depth_error: (H, W) float32, m (E_t^depth); 0 where invalid.
         color_error: (H, W) float32, sum over R, G, B in 0..1 (E_t^rgb); 0 where invalid.
+        sdf_error: (H, W) float32, |SDF| of the field at the observed points, m; None when the explicit branch alone
+            is judged. With it, the depth part is the mean of both branches' errors.
     """
 
     camera: Camera
@@ -33,18 +44,24 @@ class ViewResidual:
     depth: np.ndarray
     depth_error: np.ndarray
     color_error: np.ndarray
+    sdf_error: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         check_pose(self.T_world_camera, "view residual")
         shape = (self.camera.height, self.camera.width)
-        for name in ("depth", "depth_error", "color_error"):
+        for name in ("depth", "depth_error", "color_error", "sdf_error"):
             a = getattr(self, name)
+            if a is None:
+                continue
             if a.shape != shape or a.dtype != np.float32:
                 raise InputError(f"view residual: {name} is {a.shape} {a.dtype}, expected {shape} float32")
 
     def normalised(self, settings: UncertaintySettings, thinned: slice = slice(None)) -> np.ndarray:
         """(h, w) float32 joint residual in 0..1: each error saturates as 1 - exp(-error / scale)."""
-        depth_part = -np.expm1(self.depth_error[thinned, thinned] * np.float32(-1 / settings.depth_residual_scale_m))
+        per_m = np.float32(-1 / settings.depth_residual_scale_m)
+        depth_part = -np.expm1(self.depth_error[thinned, thinned] * per_m)
+        if self.sdf_error is not None:
+            depth_part = (depth_part - np.expm1(self.sdf_error[thinned, thinned] * per_m)) / 2
         color_part = -np.expm1(self.color_error[thinned, thinned] * np.float32(-1 / settings.color_residual_scale))
         share = np.float32(settings.depth_residual_weight)
         return share * depth_part + (1 - share) * color_part
@@ -52,7 +69,7 @@ class ViewResidual:
 
 def view_residuals(
     rendered_rgb: np.ndarray, rendered_depth: np.ndarray, rendered_alpha: np.ndarray, rgb: np.ndarray,
-    depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray,
+    depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray, query_sdf: QuerySdf | None = None,
 ) -> ViewResidual:
     """E_t^depth and E_t^rgb of one rendering.
 
@@ -63,6 +80,7 @@ def view_residuals(
             observed depth counts as depth error: a hole is as wrong as can be, not invisible.
         rgb: (H, W, 3) uint8 or float 0..1, observed. depth: (H, W) m, observed, 0 = invalid.
         camera, T_world_camera: of these images.
+        query_sdf: the field, (N, 3) world points -> (N,) m; given, its error at the observed points is kept too.
     """
     depth = np.where(np.isfinite(depth) & (depth >= camera.near) & (depth <= camera.far), depth, 0)
     depth = depth.astype(np.float32)
@@ -75,17 +93,31 @@ def view_residuals(
     color_error = np.where(valid, np.abs(rendered_rgb - rgb).sum(axis=-1), 0).astype(np.float32)
     if not (np.isfinite(depth_error).all() and np.isfinite(color_error).all()):
         raise InputError("view residual: the rendering holds NaN or infinite values where depth is valid")
-    return ViewResidual(camera, np.asarray(T_world_camera, np.float64), depth, depth_error, color_error)
+    sdf_error = None
+    if query_sdf is not None:
+        sdf_error = np.zeros(depth.shape, np.float32)
+        points = projection.unproject(depth, T_world_camera, camera)[valid]
+        sdf_error[valid] = np.abs(query_sdf(points.astype(np.float32)))
+    return ViewResidual(camera, np.asarray(T_world_camera, np.float64), depth, depth_error, color_error, sdf_error)
 
 
-def most_uncertain(views: Sequence[ViewResidual], settings: UncertaintySettings) -> list[int]:
-    """Indices of C_high: the `top_k_views` views with the largest mean residual, worst first; ties by order."""
-    thinned = slice(settings.residual_stride // 2, None, settings.residual_stride)
+def most_uncertain(
+    grid: VoxelGrid, frames: Sequence[Frame], u_exp: np.ndarray, settings: UncertaintySettings
+) -> list[int]:
+    """Indices of C_high: the `top_k_views` frames that look at the largest mean u_exp, worst first; ties by order.
+
+    The volume of the last round decides, so that only the chosen views have to be rendered.
+    """
     means = []
-    for view in views:
-        valid = view.depth[thinned, thinned] > 0
-        residual = view.normalised(settings, thinned)
-        means.append(float(residual[valid].mean(dtype=np.float64)) if valid.any() else 0.0)
+    flat = u_exp.ravel()
+    for frame in frames:
+        thinned = (slice(CHOICE_STRIDE // 2, None, CHOICE_STRIDE),) * 2
+        depth, rays = frame.depth[thinned], projection.pixel_rays(frame.camera)[thinned]
+        points = se3.transform_points(frame.T_world_camera, (rays * depth[..., None])[depth > 0].astype(np.float64))
+        ijk = grid.index_of(points)
+        ijk = ijk[grid.contains_index(ijk)]
+        voxels = np.ravel_multi_index(tuple(ijk.T), grid.shape)
+        means.append(float(flat[voxels].mean(dtype=np.float64)) if len(voxels) else 0.0)
     order = np.argsort(-np.asarray(means), kind="stable")
     return [int(i) for i in order[: settings.top_k_views]]
 
@@ -123,16 +155,26 @@ def backproject(
 def explicit_uncertainty(
     grid: VoxelGrid, views: Sequence[ViewResidual], previous: np.ndarray | None, settings: UncertaintySettings
 ) -> np.ndarray:
-    """u_exp before masking: C_high where it looked, the other views elsewhere, else the value of the last round.
+    """u_exp before masking: a running mean over the views that saw a voxel, float32 [X, Y, Z] in 0..1.
+
+    One view's residual in a voxel is noisy (few pixels, one angle), so the mean is taken over the neighbourhood
+    (`residual_blur_voxels`) and over rounds: `residual_memory` is the number of views that the last value counts for.
+    Where no view looked, the value of the last round stays; it is 0 where no view ever looked.
 
     Args:
-        views: renderings of keyframes with the current map. previous: u_exp of the last round, or None.
+        views: renderings of this round's map at observed poses. previous: u_exp of the last round, or None.
     """
-    chosen = most_uncertain(views, settings)
-    rest = [v for i, v in enumerate(views) if i not in set(chosen)]
-    u = np.zeros(grid.shape, np.float32) if previous is None else previous
-    for part in (rest, [views[i] for i in sorted(chosen)]):
-        if part:
-            residual, coverage = backproject(grid, part, settings)
-            u = np.where(coverage > 0, residual, u)
-    return u
+    before = np.zeros(grid.shape, np.float32) if previous is None else previous
+    if not views:
+        return before
+    residual, coverage = backproject(grid, views, settings)
+    count = coverage * np.float32(len(views))
+    if settings.residual_blur_voxels > 0:
+        blur = partial(gaussian_filter, sigma=settings.residual_blur_voxels, mode="constant", truncate=2.0)
+        total, count = blur(residual * count), blur(count)
+        seen = count > MIN_VIEWS
+        residual = np.where(seen, total / np.where(seen, count, 1), 0)
+        count = np.where(seen, count, 0)
+    memory = np.float32(settings.residual_memory) * (before > 0)
+    gain = np.divide(count, count + memory, out=np.zeros_like(count), where=count > 0)
+    return (before + gain * (residual - before)).astype(np.float32)

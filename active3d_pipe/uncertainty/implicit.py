@@ -7,17 +7,27 @@ from active3d_pipe.information.entropy import bernoulli_entropy
 from active3d_pipe.uncertainty.config import UncertaintySettings
 
 
-def implicit_uncertainty(sigma: np.ndarray, observed: np.ndarray, settings: UncertaintySettings) -> np.ndarray:
+def implicit_uncertainty(sigma: np.ndarray, known: np.ndarray, settings: UncertaintySettings) -> np.ndarray:
     """u_imp in 0..1 before masking, any shape.
 
     The field's sigma saturates as 1 - exp(-sigma / sigma_scale_m). Where nothing was observed the head extrapolates
-    and may say anything; there u_imp is 1, and it moves to the head's value as observation grows.
+    and may say anything; there u_imp is 1, and it moves to the head's value as knowledge grows.
 
     Args:
-        sigma: softplus output of the uncertainty head, m. observed: share of observation in 0..1.
+        sigma: softplus output of the uncertainty head, m. known: share of knowledge in 0..1, see `knowledge`.
     """
-    known = -np.expm1(sigma * np.float32(-1 / settings.sigma_scale_m))
-    return 1 - observed * (1 - known)
+    return 1 - known * np.exp(sigma * np.float32(-1 / settings.sigma_scale_m))
+
+
+def knowledge(observed: np.ndarray, hits: np.ndarray, settings: UncertaintySettings) -> np.ndarray:
+    """Share of what can be known of a voxel that was seen, float32 [X, Y, Z].
+
+    A few rays settle that a voxel is free (`observed`, see `occupancy.observation`); the shape of a surface takes
+    many that end on it. Their number falls with distance and grazing angle, so that surface seen from afar or
+    along itself stays less known.
+    """
+    surface = -np.expm1(hits * np.float32(-1 / settings.surface_rays))
+    return np.where(hits > 0, observed * surface, observed).astype(np.float32)
 
 
 def cube_support(sdf: np.ndarray, voxel_size: float) -> np.ndarray:

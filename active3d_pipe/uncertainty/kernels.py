@@ -279,3 +279,73 @@ def splat_opacity(means, log_scales, quats, logits, origin, inv_voxel, mass):
                 r = root3 * math.exp(log_scales[g, a]) * inv_voxel
                 _add_mass(mx + r * rx, my + r * ry, mz + r * rz, m / 6.0, mass[c])
                 _add_mass(mx - r * rx, my - r * ry, mz - r * rz, m / 6.0, mass[c])
+
+
+@njit(cache=True)
+def _mark_path(ox, oy, oz, ex, ey, ez, shape, blocked, stamp, frame_id, vain, seen_id):
+    """Stamp the voxels of the segment o -> e up to the first blocked one; with `vain`, stamp only what is unstamped.
+
+    `stamp` holds 2 * frame + 1 where a reading passed in this frame and 2 * frame + 2 where only lost rays did.
+    """
+    nx, ny, nz = shape
+    dx, dy, dz = ex - ox, ey - oy, ez - oz
+    t0, t1 = _clip(ox, dx, nx, 0.0, 1.0)
+    t0, t1 = _clip(oy, dy, ny, t0, t1)
+    t0, t1 = _clip(oz, dz, nz, t0, t1)
+    if t0 >= t1:
+        return
+    i, si, left_i, ti, gi = _start(ox, dx, nx, t0, ny * nz)
+    j, sj, left_j, tj, gj = _start(oy, dy, ny, t0, nz)
+    k, sk, left_k, tk, gk = _start(oz, dz, nz, t0, 1)
+    v = (i * ny + j) * nz + k
+    while True:
+        if vain and blocked[np.uintp(v)]:
+            return
+        if not vain or stamp[np.uintp(v)] != seen_id:
+            stamp[np.uintp(v)] = frame_id
+        if ti <= tj and ti <= tk:
+            if ti >= t1 or left_i == 0:
+                return
+            left_i -= 1
+            v += si
+            ti += gi
+        elif tj <= tk:
+            if tj >= t1 or left_j == 0:
+                return
+            left_j -= 1
+            v += sj
+            tj += gj
+        else:
+            if tk >= t1 or left_k == 0:
+                return
+            left_k -= 1
+            v += sk
+            tk += gk
+
+
+@njit(cache=True)
+def mark_vain(depth, camera, pose, reach, start, stride, origin, inv_voxel, range_m, blocked, stamp, frame, vain):
+    """vain = 1 in voxels up to depth `range_m` that only rays without a reading crossed in this frame.
+
+    blocked, vain (X, Y, Z) uint8, stamp (X, Y, Z) i32 that starts below 0; see `_mark_path`.
+    """
+    near, far = reach
+    seen_id, lost_id = 2 * frame + 1, 2 * frame + 2
+    ox, oy, oz = _pixel_end(0, 0, 0.0, camera, pose, origin, inv_voxel)
+    flat_stamp, flat_blocked, flat_vain = stamp.ravel(), blocked.ravel(), vain.ravel()
+    for lost in range(2):
+        for i in range(start[0], depth.shape[0], stride):
+            for j in range(start[1], depth.shape[1], stride):
+                d = depth[i, j]
+                has_reading = d >= near and d > 0.0 and d < math.inf
+                if has_reading == (lost == 1):
+                    continue
+                e = range_m if lost else min(d, far)
+                ex, ey, ez = _pixel_end(i, j, e, camera, pose, origin, inv_voxel)
+                _mark_path(
+                    ox, oy, oz, ex, ey, ez, stamp.shape, flat_blocked, flat_stamp, lost_id if lost else seen_id,
+                    lost == 1, seen_id,
+                )
+    for v in range(flat_stamp.size):
+        if flat_stamp[v] == lost_id:
+            flat_vain[v] = 1

@@ -36,6 +36,16 @@ def attention(evidence: RayEvidence, settings: UncertaintySettings) -> np.ndarra
     return np.minimum(1, 2 * expit(ray_log_odds(evidence, settings)))
 
 
+def resolvable(vain_looks: np.ndarray, observed: np.ndarray, settings: UncertaintySettings) -> np.ndarray:
+    """Share of a voxel's uncertainty that another look may still settle; float32 [X, Y, Z].
+
+    Every round of looks in vain leaves `vain_keep` of what is unseen (mirrors, glass, missing depth); what rays did
+    observe is not touched.
+    """
+    lost = 1 - np.float32(settings.vain_keep) ** vain_looks
+    return 1 - (1 - observed) * lost
+
+
 def opacity_mass(grid: VoxelGrid, gaussians: GaussianModel) -> np.ndarray:
     """Opaque area of the Gaussians in each voxel, in units of a voxel face; float32 [X, Y, Z]."""
     mass = np.zeros((kernels.CHUNKS, *grid.shape), np.float32)

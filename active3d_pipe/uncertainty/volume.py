@@ -3,13 +3,14 @@
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from scipy.ndimage import maximum_filter
 from scipy.special import expit
 
 from active3d_pipe.errors import InputError, NumericalError
 from active3d_pipe.information.entropy import bernoulli_entropy
 from active3d_pipe.structures import Frame, GaussianModel, UncertaintyVolume, VoxelGrid
 from active3d_pipe.uncertainty import explicit, fusion, implicit, occupancy, temporal
-from active3d_pipe.uncertainty.carving import RayEvidence, integrate_depth
+from active3d_pipe.uncertainty.carving import RayEvidence, integrate_depth, looks_in_vain
 from active3d_pipe.uncertainty.config import UncertaintySettings
 from active3d_pipe.uncertainty.explicit import ViewResidual
 
@@ -60,16 +61,24 @@ def compute_volume(  # noqa: PLR0913  (the inputs of the stage, by name)
 
     sdf, sigma = _query(grid, field_query)
     observed = occupancy.observation(evidence, settings)
-    attention = occupancy.attention(evidence, settings)
+    vain = looks_in_vain(grid, new_frames, evidence.hit > 0, settings)
+    if previous is not None:
+        vain = vain + previous["vain_looks"]
+    open_share = occupancy.resolvable(vain, observed, settings)
+    attention = open_share * occupancy.attention(evidence, settings)
     support = implicit.cube_support(sdf, grid.voxel_size)
     p_imp = implicit.implicit_occupancy(sdf, sigma, observed, support, settings)
     log_odds = occupancy.explicit_log_odds(evidence, occupancy.opacity_mass(grid, gaussians), settings)
     entropy_imp = attention * implicit.implicit_entropy(sdf, sigma, observed, support, settings)
-    entropy_exp = bernoulli_entropy(expit(log_odds))
+    entropy_exp = open_share * bernoulli_entropy(expit(log_odds))
 
-    u_imp = attention * implicit.implicit_uncertainty(sigma, observed, settings)
+    known = implicit.knowledge(observed, evidence.hit, settings)
+    u_imp = attention * implicit.implicit_uncertainty(sigma, known, settings)
     last_u_exp = None if previous is None else previous["u_exp"]
-    u_exp = attention * explicit.explicit_uncertainty(grid, views, last_u_exp, settings)
+    # Residuals lie at observed depths, never at phantoms, and their trilinear weights reach the voxels beside a
+    # surface, which may prove to hold it; only what lies in the midst of free space is forgotten.
+    near = maximum_filter(attention, size=3, mode="nearest")
+    u_exp = near * explicit.explicit_uncertainty(grid, views, last_u_exp, settings)
     u_time = np.zeros(grid.shape, np.float32)
     if previous is not None:
         # What the field does in space known to be free is a phantom, unless this round's rays found it otherwise;
@@ -96,6 +105,7 @@ def compute_volume(  # noqa: PLR0913  (the inputs of the stage, by name)
         "free_evidence": evidence.free,
         "hit_evidence": evidence.hit,
         "view_quality": evidence.quality,
+        "vain_looks": vain,
     }
     arrays = {name: np.ascontiguousarray(array, dtype=np.float32) for name, array in arrays.items()}
     return UncertaintyVolume(grid, round, arrays, fused.to_json(statistics, len(targets)))

@@ -106,25 +106,46 @@ def test_backprojection_lands_on_the_surface_and_is_deterministic():
     assert got.tobytes() == backproject(grid, views, S)[0].tobytes()
 
 
-def test_c_high_holds_the_worst_views():
-    fs = frames((0, 20, 40, 60))
-    views = [residual(f, depth_error=e) for f, e in zip(fs, (0.01, 0.2, 0.0, 0.05))]
-    assert most_uncertain(views, UncertaintySettings(top_k_views=2)) == [1, 3]
-    assert most_uncertain(views, S) == [1, 3, 0, 2]
+def test_c_high_looks_where_the_last_round_was_worst():
+    grid, fs = room_grid(), frames((0, 90, 180, 270))
+    u = np.zeros(grid.shape, np.float32)
+    for f, level in zip(fs, (0.1, 0.8, 0.0, 0.4)):
+        ijk = grid.index_of(projection.unproject(f.depth, f.T_world_camera, f.camera).reshape(-1, 3))
+        u[tuple(ijk[grid.contains_index(ijk)].T)] = level
+    assert most_uncertain(grid, fs, u, UncertaintySettings(top_k_views=2)) == [1, 3]
+    assert most_uncertain(grid, fs, u, UncertaintySettings(top_k_views=9)) == [1, 3, 0, 2]
+    blind = frame(9, pose(0))
+    blind = type(blind)(9, 0, blind.camera, blind.T_world_camera, blind.rgb, np.zeros_like(blind.depth))
+    assert most_uncertain(grid, [blind, fs[0]], u, S) == [1, 0]
+    assert most_uncertain(grid, [], u, S) == []
 
 
-def test_worst_views_decide_and_the_rest_fills_in():
-    grid = room_grid()
-    worst, other, twin = frame(0, pose(0)), frame(1, pose(180)), frame(2, pose(0))
-    views = [residual(worst, 0.2), residual(other, 0.02), residual(twin, 0.0)]
-    s = UncertaintySettings(top_k_views=1)
-    u = explicit_uncertainty(grid, views, None, s)
-    ahead, behind = (backproject(grid, [v], s)[1] > 0 for v in views[:2])
-    expected_worst, expected_other = -np.expm1(-0.2 / 0.05) / 2, -np.expm1(-0.02 / 0.05) / 2
-    np.testing.assert_allclose(u[ahead], expected_worst, atol=1e-3)
-    np.testing.assert_allclose(u[behind & ~ahead], expected_other, atol=1e-3)
-    kept = explicit_uncertainty(grid, [], u, s)
-    np.testing.assert_array_equal(kept, u)
+def test_u_exp_is_a_running_mean_over_the_views_that_saw_a_voxel():
+    grid, s = room_grid(), UncertaintySettings(residual_stride=1, residual_blur_voxels=0, residual_memory=3)
+    here, there = frame(0, pose(0)), frame(1, pose(180))
+    first = explicit_uncertainty(grid, [residual(here, 0.2), residual(there, 0.02)], None, s)
+    ahead, behind = (backproject(grid, [residual(f)], s)[1] > 0 for f in (here, there))
+    high, low = -np.expm1(-0.2 / 0.05) / 2, -np.expm1(-0.02 / 0.05) / 2
+    np.testing.assert_allclose(first[ahead & ~behind], high, atol=1e-3)
+    np.testing.assert_allclose(first[behind & ~ahead], low, atol=1e-3)
+    assert not first[~ahead & ~behind].any()
+    # The map became perfect there: one view against three remembered ones.
+    second = explicit_uncertainty(grid, [residual(here)], first, s)
+    np.testing.assert_allclose(second[ahead & ~behind], high * 3 / 4, atol=1e-3)
+    np.testing.assert_array_equal(second[behind & ~ahead], first[behind & ~ahead])
+    np.testing.assert_array_equal(explicit_uncertainty(grid, [], first, s), first)
+
+
+def test_blurred_residuals_keep_their_mean_and_reach_the_neighbours():
+    grid, f = room_grid(), frame(0, pose(0))
+    sharp, blurred = (
+        explicit_uncertainty(grid, [residual(f, 0.2)], None, UncertaintySettings(residual_blur_voxels=b))
+        for b in (0, 0.7)
+    )
+    level = -np.expm1(-0.2 / 0.05) / 2
+    assert (blurred > 0).sum() > (sharp > 0).sum()
+    assert ((blurred > 0) | (sharp == 0)).all()
+    np.testing.assert_allclose(blurred[blurred > 0], level, atol=1e-3)
 
 
 def test_malformed_views_are_refused():

@@ -58,7 +58,7 @@ def test_changes_that_matter(now, before, flagged):
 
 def test_decays_when_nothing_changes_and_irrelevant_changes_are_ignored():
     values = [one(0.0, 0.09)]
-    for _ in range(6):
+    for _ in range(20):
         values.append(one(0.0, 0.0, values[-1]))
     assert values[0] > 0.8
     assert values[-1] < 0.02
