@@ -7,20 +7,19 @@ MAX_FRAMES = 700  # logged frames that refinement and culling use, evenly spread
 
 
 def _inputs(last_round: int) -> tuple[NodeId, ...]:
-    return (*shared.captures(last_round), NodeId("mapping", last_round), NodeId("uncertainty", last_round))
+    return (*shared.captures(last_round), NodeId("mapping", last_round))
 
 
 def _run(context: StageContext) -> None:
     import time
 
-    from active3d_pipe.export.isosurface import colour_mesh, cull_unseen, extract_mesh, near_surface
+    from active3d_pipe.export.final_mesh import final_mesh
     from active3d_pipe.mapping.refine import refine
-    from active3d_pipe.storage import meshes, splats, volumes
+    from active3d_pipe.storage import meshes, splats
     from active3d_pipe.storage.files import write_json
 
     config, last = context.config, context.last_round
     hybrid = shared.load_map(context.input("mapping", last), context.inputs, config)
-    volume = volumes.read_volume(context.input("uncertainty", last) / shared.VOLUME_NAME)
     frames = [f for k in range(last + 1) for f in shared.load_frames(context.input("capture", k))]
     frames = shared.spread(frames, MAX_FRAMES)
     report = refine(hybrid, frames, context.rng("refinement"), context.progress)
@@ -28,12 +27,7 @@ def _run(context: StageContext) -> None:
 
     start = time.perf_counter()
     context.progress("extracting the mesh")
-    settings = config.export.mesh
-    observed = near_surface(volume["hit_evidence"], settings.dilate_voxels)
-    grid, field = volume.grid, hybrid.field
-    mesh = extract_mesh(field.query_sdf, field.low, field.high, settings, grid=grid, observed=observed)
-    mesh = cull_unseen(mesh, frames, settings)
-    mesh = colour_mesh(mesh, field.query_color)
+    mesh = final_mesh(hybrid.field, frames, config.export.mesh)
     context.timings["mesh"] = time.perf_counter() - start
 
     shared.save_map(context.out, hybrid)
@@ -47,4 +41,4 @@ def _run(context: StageContext) -> None:
     context.notes.update(numbers)
 
 
-STAGE = Stage(name="export", version=1, config=("mapping", "export"), inputs=_inputs, run=_run, loop=False)
+STAGE = Stage(name="export", version=2, config=("mapping", "export"), inputs=_inputs, run=_run, loop=False)

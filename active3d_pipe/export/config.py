@@ -1,5 +1,7 @@
 """Knobs of the final models."""
 
+from typing import Literal
+
 from pydantic import Field
 
 from active3d_pipe.structures import Settings
@@ -11,9 +13,14 @@ class MeshSettings(Settings):
     voxel_size_m: float = Field(0.02, gt=0, description="edge of a marching-cubes cell, m")
     block_cells: int = Field(64, ge=8, multiple_of=2, description="edge of the blocks that bound the memory, cells")
     refine_margin: float = Field(
-        1.25, ge=1, description="factor on the distance within which a coarse cell is refined; 1 trusts the SDF fully"
+        1.25, ge=1, description="a coarse cell is refined when a corner is within this many fine cells of the surface"
     )
-    dilate_voxels: int = Field(1, ge=0, description="how far beyond observed surface voxels the surface may run")
+    dilate_voxels: int = Field(
+        1, ge=0, description="how far beyond the volume's surface voxels the preview may run, voxels"
+    )
+    dilate_cells: int = Field(
+        2, ge=0, description="how far from a depth reading the surface may run, coarse cells (two marching-cubes cells)"
+    )
     min_component_m2: float = Field(
         0.004, ge=0, description="connected pieces of less area are dropped as spurious, m2"
     )
@@ -22,6 +29,15 @@ class MeshSettings(Settings):
     )
     cull_facing_cosine: float = Field(
         0.0, ge=-1, le=1, description="a face is seen only by cameras towards which its normal has at least this cosine"
+    )
+    cull_margin_m: float = Field(
+        0.08, ge=0, description="faces this near to seen ones are kept although no frame saw them, m"
+    )
+    colour: Literal["views", "field"] = Field(
+        "views", description="views: from the logged frames that see a vertex; field: the field's own, softer"
+    )
+    colour_tolerance_m: float = Field(
+        0.015, gt=0, description="a vertex this far from an observed depth takes colour from that frame, m"
     )
 
 

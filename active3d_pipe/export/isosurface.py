@@ -1,20 +1,17 @@
 """The zero level of the SDF as a triangle mesh: blocked, coarse to fine, only where surface was observed."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 import numpy as np
 from scipy.ndimage import binary_dilation
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from skimage.measure import marching_cubes
 
 from active3d_pipe.errors import ConfigError, InputError
+from active3d_pipe.export import kernels_marching as kernels
 from active3d_pipe.export.config import MeshSettings
-from active3d_pipe.export.kernels_culling import mark_seen
-from active3d_pipe.structures import Frame, TriangleMesh, VoxelGrid
+from active3d_pipe.structures import TriangleMesh, VoxelGrid
 
 QuerySdf = Callable[[np.ndarray], np.ndarray]
-QueryColor = Callable[[np.ndarray], np.ndarray]
+UNKNOWN = np.float32(1e3)  # SDF of nodes that no marked cell has
 
 
 def near_surface(hit_evidence: np.ndarray, dilate_voxels: int) -> np.ndarray:
@@ -40,15 +37,15 @@ def extract_mesh(
         query_sdf: (N, 3) float32 world points -> (N,) SDF, m, positive in free space.
         low, high: (3,) corners of the box, world, m.
         settings: cell size and block size; see `MeshSettings`.
-        grid, observed: a voxel grid and a bool volume on it (`near_surface`); outside of it no surface is
-            extracted. Without them the whole box counts as observed.
+        grid, observed: a voxel grid and a bool volume on it (`near_surface`, `near_readings`); outside of it no
+            surface is extracted. Without them the whole box counts as observed.
 
     Returns:
         Mesh without colours; the faces' normals (right-hand rule) point into free space. Blocks are welded, small
         loose pieces are dropped.
 
-    A cell of two by two by two is refined when a corner is nearer to the surface than its half diagonal: no
-    surface can pass through it otherwise, if the SDF is a distance (`refine_margin` allows for the rest).
+    A cell of two by two by two is refined when the signs at its corners differ or a corner is within `refine_margin`
+    fine cells of the surface: a plane through the cell passes its nearest corner within one.
     """
     low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
     if not (high > low).all():
@@ -58,119 +55,99 @@ def extract_mesh(
         raise InputError("mesh: `grid` and `observed` must be given together and have one shape")
     size, block = settings.voxel_size_m, settings.block_cells
     cells = np.maximum(np.ceil((high - low) / size - 1e-9).astype(int), 2)
-    vertices, faces, count = [], [], 0
+    pieces, count = [], 0
     for start in np.ndindex(*(-(-int(n) // block) for n in cells)):
-        base = np.array(start) * block
+        base = np.array(start, np.int64) * block
         shape = np.minimum(base + block, cells + cells % 2) - base
-        piece = _block(query_sdf, low, base, shape, settings, grid, observed)
+        coarse = _observed_cells(low, base, shape // 2, size, grid, observed)
+        piece = _block(query_sdf, low, base, coarse, settings) if coarse.any() else None
         if piece is not None:
-            vertices.append(piece[0])
-            faces.append(piece[1] + count)
+            pieces.append((piece[0], piece[1], piece[2] + np.int32(count)))
             count += len(piece[0])
-    if not vertices:
+    if not pieces:
         return TriangleMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
-    index, triangles = _weld(np.concatenate(vertices), np.concatenate(faces), block)
-    mesh = TriangleMesh((low + index * size).astype(np.float32), triangles.astype(np.int32))
-    return drop_small_components(mesh, settings.min_component_m2)
+    vertices, keys, faces = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
+    mesh = TriangleMesh((low + vertices * size).astype(np.float32), faces)
+    return drop_small_components(_weld(mesh, keys, block), settings.min_component_m2)
 
 
-def _observed_at(points: np.ndarray, grid: VoxelGrid, observed: np.ndarray) -> np.ndarray:
-    ijk = grid.index_of(points)
-    inside = grid.contains_index(ijk)
-    out = np.zeros(points.shape[:-1], bool)
-    out[inside] = observed[tuple(ijk[inside].T)]
-    return out
+def _observed_cells(
+    low: np.ndarray, base: np.ndarray, shape: np.ndarray, size: float, grid: VoxelGrid | None,
+    observed: np.ndarray | None,
+) -> np.ndarray:
+    """(X, Y, Z) bool, which cells of two fine cells have their centre in an observed voxel."""
+    if grid is None or observed is None:
+        return np.ones(tuple(shape), bool)
+    index, inside = [], []
+    for d in range(3):
+        centre = low[d] + (base[d] + 2 * np.arange(shape[d]) + 1) * size
+        i = np.floor((centre - grid.origin[d]) / grid.voxel_size).astype(np.int64)
+        inside.append((i >= 0) & (i < grid.shape[d]))
+        index.append(np.clip(i, 0, grid.shape[d] - 1))
+    x, y, z = inside
+    return observed[np.ix_(*index)] & x[:, None, None] & y[:, None] & z
 
 
 def _block(
-    query_sdf: QuerySdf, low: np.ndarray, base: np.ndarray, shape: np.ndarray, settings: MeshSettings,
-    grid: VoxelGrid | None, observed: np.ndarray | None,
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Vertices (V, 3) float64 in cells from `low`, and faces, of the cells base .. base + shape; None if empty."""
+    query_sdf: QuerySdf, low: np.ndarray, base: np.ndarray, coarse: np.ndarray, settings: MeshSettings
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Vertices (V, 3) float64 in lattice units, their keys (V, 4) and faces of one block; None if it is empty."""
     size = settings.voxel_size_m
-    coarse = np.ones(tuple(shape // 2), bool)
-    if grid is not None and observed is not None:
-        centres = np.stack(np.meshgrid(*((b + 2 * np.arange(n) + 1) * size + o for b, n, o in
-                                         zip(base, coarse.shape, low, strict=True)), indexing="ij"), axis=-1)
-        coarse = _observed_at(centres, grid, observed)
-        if not coarse.any():
-            return None
-    sdf = _evaluate(query_sdf, low, base, _nodes_of(coarse), 2, size)
-    nearest = np.full(coarse.shape, np.inf, np.float32)
-    for corner in np.ndindex(2, 2, 2):
-        part = sdf[tuple(slice(c, c + n) for c, n in zip(corner, coarse.shape, strict=True))]
-        np.minimum(nearest, np.abs(part), out=nearest)
-    coarse &= nearest <= settings.refine_margin * np.sqrt(3) * size
-    if not coarse.any():
+    values, known = _blank(coarse.shape)
+    _evaluate(query_sdf, coarse, low, base, 2, size, values, known)
+    fine = np.zeros(tuple(2 * n for n in coarse.shape), bool)
+    sdf, known = _blank(fine.shape)
+    if not kernels.refine(coarse, values, settings.refine_margin * size, fine, sdf, known):
         return None
-    fine = coarse.repeat(2, 0).repeat(2, 1).repeat(2, 2)
-    nodes = _nodes_of(fine)
-    sdf = _evaluate(query_sdf, low, base, nodes, 1, size)
-    values = sdf[nodes]
-    if values.min() > 0 or values.max() < 0:
+    _evaluate(query_sdf, fine, low, base, 1, size, sdf, known)
+    triangles = kernels.count_triangles(fine, sdf, kernels.TRIANGLE_COUNT)
+    if triangles == 0:
         return None
-    # skimage processes the cell whose *highest* corner is marked.
-    mask = np.zeros(nodes.shape, bool)
-    mask[1:, 1:, 1:] = fine
-    try:
-        local, faces, _, _ = marching_cubes(sdf, 0.0, mask=mask, allow_degenerate=False)
-    except RuntimeError:  # both signs occur, but in no common cell
-        return None
-    return local.astype(np.float64) + base, faces.astype(np.int64)
+    vertices, keys = np.empty((3 * triangles, 3)), np.empty((3 * triangles, 4), np.int64)
+    faces = np.empty((triangles, 3), np.int32)
+    made = kernels.triangulate(
+        fine, sdf, kernels.TRIANGLE_COUNT, kernels.TRIANGLE_EDGES, kernels.EDGE_CORNER, kernels.EDGE_AXIS, base,
+        np.full((*sdf.shape, 3), -1, np.int32), vertices, keys, faces,
+    )
+    return vertices[:made].copy(), keys[:made].copy(), faces
 
 
-def _nodes_of(cells: np.ndarray) -> np.ndarray:
-    """Corners (X + 1, Y + 1, Z + 1) bool of the marked cells (X, Y, Z)."""
-    nodes = np.zeros(tuple(n + 1 for n in cells.shape), bool)
-    for corner in np.ndindex(2, 2, 2):
-        nodes[tuple(slice(c, c + n) for c, n in zip(corner, cells.shape, strict=True))] |= cells
-    return nodes
+def _blank(cells: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """SDF of the nodes of a block of cells, unknown everywhere, and which are known."""
+    shape = tuple(n + 1 for n in cells)
+    return np.full(shape, UNKNOWN), np.zeros(shape, bool)
 
 
 def _evaluate(
-    query_sdf: QuerySdf, low: np.ndarray, base: np.ndarray, nodes: np.ndarray, step: int, size: float
-) -> np.ndarray:
-    """SDF on the marked nodes (spacing step * size), +inf-like elsewhere."""
-    ijk = np.argwhere(nodes)
-    points = low + (base + step * ijk) * size
-    sdf = np.full(nodes.shape, 1e3, np.float32)
-    sdf[nodes] = query_sdf(points.astype(np.float32))
-    return sdf
+    query_sdf: QuerySdf, cells: np.ndarray, low: np.ndarray, base: np.ndarray, step: int, size: float,
+    sdf: np.ndarray, known: np.ndarray,
+) -> None:
+    """SDF at the nodes of the marked cells that are not known yet."""
+    nodes, points = np.empty(sdf.size, np.int64), np.empty((sdf.size, 3), np.float32)
+    count = kernels.gather_nodes(cells, known, low, base, step, size, nodes, points)
+    if count:
+        sdf.reshape(-1)[nodes[:count]] = query_sdf(points[:count])
 
 
-def _weld(vertices: np.ndarray, faces: np.ndarray, block: int) -> tuple[np.ndarray, np.ndarray]:
-    """Merge the vertices that neighbouring blocks share on their common plane.
-
-    A vertex lies on a lattice edge, so (lower node, axis) names it exactly; only vertices with a
-    coordinate on a block border are looked at.
-    """
-    nearest = np.rint(vertices)
-    on_node = np.abs(vertices - nearest) < 1e-4
-    border = (on_node & (nearest.astype(np.int64) % block == 0)).any(axis=1)
+def _weld(mesh: TriangleMesh, keys: np.ndarray, block: int) -> TriangleMesh:
+    """Merge the vertices that neighbouring blocks share on their common plane; keys (V, 4) name lattice edges."""
+    across = keys[:, :3] % block == 0
+    axis = keys[:, 3]
+    border = ((across[:, 0] & (axis != 0)) | (across[:, 1] & (axis != 1)) | (across[:, 2] & (axis != 2)))
     picked = np.flatnonzero(border)
-    lower = np.where(on_node[picked], nearest[picked], np.floor(vertices[picked])).astype(np.int64)
-    axis = np.where(on_node[picked].all(axis=1), 3, np.argmin(on_node[picked], axis=1))
-    _, first, inverse = np.unique(np.column_stack([lower, axis]), axis=0, return_index=True, return_inverse=True)
-    target = np.arange(len(vertices))
+    extent = keys[:, :3].max(axis=0) + 1
+    flat = ((keys[picked, 0] * extent[1] + keys[picked, 1]) * extent[2] + keys[picked, 2]) * 3 + axis[picked]
+    _, first, inverse = np.unique(flat, return_index=True, return_inverse=True)
+    target = np.arange(len(mesh.vertices), dtype=np.int32)
     target[picked] = picked[first[inverse.reshape(-1)]]
-    faces = target[faces]
-    proper = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 0] != faces[:, 2])
-    return _compact(vertices, faces[proper])
-
-
-def _compact(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Drop vertices that no face uses."""
-    used = np.zeros(len(vertices), bool)
-    used[faces] = True
-    renumber = np.cumsum(used) - 1
-    return vertices[used], renumber[faces]
+    return keep_faces(TriangleMesh(mesh.vertices, target[mesh.faces]), np.ones(len(mesh.faces), bool))
 
 
 def keep_faces(mesh: TriangleMesh, keep: np.ndarray) -> TriangleMesh:
     """The mesh of the faces with `keep` (F,) bool, without unused vertices."""
     used = np.zeros(len(mesh.vertices), bool)
     faces = mesh.faces[keep]
-    used[faces] = True
+    used[faces.reshape(-1)] = True
     renumber = (np.cumsum(used) - 1).astype(np.int32)
     colors = None if mesh.colors is None else mesh.colors[used]
     return TriangleMesh(mesh.vertices[used], renumber[faces].reshape(-1, 3), colors)
@@ -180,49 +157,14 @@ def drop_small_components(mesh: TriangleMesh, min_area_m2: float) -> TriangleMes
     """Drop the connected pieces (by shared vertices) of less than `min_area_m2`."""
     if min_area_m2 <= 0 or len(mesh.faces) == 0:
         return mesh
-    f = mesh.faces
-    rows, columns = f[:, [0, 1]].reshape(-1), f[:, [1, 2]].reshape(-1)
-    n = len(mesh.vertices)
-    _, label = connected_components(coo_matrix((np.ones(len(rows), bool), (rows, columns)), (n, n)), directed=False)
-    of_face = label[f[:, 0]]
-    area = np.bincount(of_face, weights=np.linalg.norm(_face_normals(mesh), axis=1))
+    labels = np.empty(len(mesh.vertices), np.int64)
+    kernels.component_labels(mesh.faces, labels)
+    of_face = labels[mesh.faces[:, 0]]
+    area = np.bincount(of_face, weights=np.linalg.norm(face_normals(mesh), axis=1), minlength=len(labels))
     return keep_faces(mesh, (area >= min_area_m2)[of_face])
 
 
-def _face_normals(mesh: TriangleMesh) -> np.ndarray:
+def face_normals(mesh: TriangleMesh) -> np.ndarray:
     """(F, 3) float64 normals whose length is the area, m2."""
     a, b, c = (mesh.vertices[mesh.faces[:, i]].astype(np.float64) for i in range(3))
     return 0.5 * np.cross(b - a, c - a)
-
-
-def colour_mesh(mesh: TriangleMesh, query_color: QueryColor) -> TriangleMesh:
-    """The mesh with the colour of `query_color` ((N, 3) world points -> (N, 3) in 0..1) at every vertex."""
-    color = np.clip(np.asarray(query_color(mesh.vertices)), 0, 1)
-    return TriangleMesh(mesh.vertices, mesh.faces, np.rint(color * 255).astype(np.uint8).reshape(-1, 3))
-
-
-def cull_unseen(mesh: TriangleMesh, frames: Iterable[Frame], settings: MeshSettings) -> TriangleMesh:
-    """Drop the faces that no frame saw.
-
-    A frame sees a face when the face's centroid projects onto a pixel with a depth reading, lies at most
-    `cull_tolerance_m` behind that depth, and the face is turned towards the camera (`cull_facing_cosine`): the
-    field also has a zero level where it returns to free behind a surface, and that sheet looks away.
-    """
-    if len(mesh.faces) == 0:
-        return mesh
-    centroids = mesh.vertices[mesh.faces].mean(axis=1, dtype=np.float64).astype(np.float32)
-    normals = _face_normals(mesh)
-    normals = (normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)).astype(np.float32)
-    seen = np.zeros(len(mesh.faces), bool)
-    pending = np.arange(len(mesh.faces))
-    for frame in frames:
-        T, c = frame.T_world_camera.astype(np.float32), frame.camera
-        mark_seen(
-            pending, centroids, normals, np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3]),
-            np.array([c.fx, c.fy, c.cx, c.cy], np.float32), frame.depth, np.float32(c.near),
-            np.float32(settings.cull_tolerance_m), np.float32(settings.cull_facing_cosine), seen,
-        )
-        pending = pending[~seen[pending]]
-        if len(pending) == 0:
-            break
-    return keep_faces(mesh, seen)

@@ -4,16 +4,10 @@ from scipy.spatial import cKDTree
 
 from active3d_pipe.errors import ConfigError, InputError
 from active3d_pipe.export.config import MeshSettings
-from active3d_pipe.export.isosurface import (
-    colour_mesh,
-    cull_unseen,
-    drop_small_components,
-    extract_mesh,
-    keep_faces,
-    near_surface,
-)
-from active3d_pipe.geometry import projection, se3
-from active3d_pipe.structures import Camera, Frame, TriangleMesh, VoxelGrid
+from active3d_pipe.export.isosurface import drop_small_components, extract_mesh, keep_faces, near_surface
+from active3d_pipe.export.kernels_marching import EDGES, TRIANGLE_COUNT, TRIANGLE_EDGES
+from active3d_pipe.export.view_fusion import colour_mesh, cull_unseen
+from active3d_pipe.structures import TriangleMesh, VoxelGrid
 
 CENTRE, RADIUS = np.array([0.03, -0.02, 0.05]), 0.3
 LOW, HIGH = np.full(3, -0.5), np.full(3, 0.5)
@@ -94,54 +88,29 @@ def test_field_without_surface_gives_an_empty_mesh():
     assert cull_unseen(mesh, [], SETTINGS) is mesh
 
 
-def test_colour(ball):
-    painted = colour_mesh(ball, lambda p: np.stack([p[:, 0] > 0, p[:, 1] * 0 + 0.5, p[:, 2] * 9], axis=1))
-    assert painted.colors.dtype == np.uint8
-    np.testing.assert_array_equal(painted.colors[:, 0], np.where(ball.vertices[:, 0] > 0, 255, 0))
-    assert (painted.colors[:, 1] == 128).all() and painted.colors[:, 2].max() == 255
+def test_every_case_separates_solid_from_free_corners():
+    for case in range(256):
+        solid = [bool(case >> c & 1) for c in range(8)]
+        triangles = TRIANGLE_EDGES[case, : TRIANGLE_COUNT[case]]
+        cut = {i for i, (a, b) in enumerate(EDGES) if solid[a] != solid[b]}
+        assert set(triangles.reshape(-1).tolist()) == cut
+        # Edges of triangles inside the cell are shared by two of them in opposite directions; the others lie on the
+        # cell's faces, where the neighbour goes on, and close to loops: one leaves and one enters every vertex.
+        ways = [(int(t[k]), int(t[(k + 1) % 3])) for t in triangles for k in range(3)]
+        assert len(set(ways)) == len(ways)
+        rim = [w for w in ways if w[::-1] not in ways]
+        assert sorted(a for a, _ in rim) == sorted(b for _, b in rim) == sorted(cut)
 
 
-def frame_of(camera, T, depth):
-    return Frame(0, 0, camera, T, np.zeros((*depth.shape, 3), np.uint8), depth.astype(np.float32))
+def test_any_signs_give_a_surface_without_cracks():
+    values = np.random.default_rng(1).normal(size=(41, 41, 41)).astype(np.float32)
+    values[[0, 1, -2, -1]] = values[:, [0, 1, -2, -1]] = values[:, :, [0, 1, -2, -1]] = 1
 
+    def noise(points):
+        return 0.01 * values[tuple(np.rint((points + 0.5) * 40).astype(int).T)]
 
-def test_cull_keeps_what_a_frame_saw(ball):
-    camera = Camera.from_fov(240, 240, 60)
-    T = se3.look_at(CENTRE + np.array([1.0, 0, 0]), CENTRE)
-    v = np.linspace(-1, 1, 240) * (1 - 1 / 240) * np.tan(np.radians(30))
-    x, y = np.meshgrid(v, v)
-    a = x**2 + y**2 + 1
-    disc = 1 - a * (1 - RADIUS**2)
-    depth = np.where(disc > 0, (1 - np.sqrt(np.maximum(disc, 0))) / a, 0)
-    seen = cull_unseen(ball, [frame_of(camera, T, depth)], SETTINGS)
-    _, centroid = normals_of(seen)
-    side = (centroid - CENTRE)[:, 0] / RADIUS
-    assert side.min() > 0.2  # the cap that looks at the camera, cos > R / distance = 0.3
-    assert seen.area_m2 == pytest.approx(2 * np.pi * RADIUS**2 * (1 - 0.3), rel=0.05)
-    # A reading in front hides everything.
-    blocked = cull_unseen(ball, [frame_of(camera, T, np.where(depth > 0, 0.4, 0))], SETTINGS)
-    assert len(blocked.faces) == 0
-
-
-def test_cull_agrees_with_the_slow_formula(ball):
-    rng = np.random.default_rng(0)
-    camera = Camera.from_fov(40, 30, 80)
-    T = se3.look_at(CENTRE + np.array([0.5, 0.6, 0.2]), CENTRE + np.array([0.1, 0, 0.1]))
-    frame = frame_of(camera, T, rng.uniform(0, 1, (30, 40)) * (rng.random((30, 40)) < 0.8))
-    normal, centroid = normals_of(ball)
-    expected = np.zeros(len(ball.faces), bool)
-    for k in range(len(expected)):
-        uv, z = projection.project(centroid[k].astype(np.float64), T, camera)
-        if projection.in_image(uv, z, camera):
-            d = frame.depth[int(uv[1]), int(uv[0])]
-            to_camera = T[:3, 3] - centroid[k]
-            cosine = normal[k] @ to_camera / np.linalg.norm(normal[k]) / np.linalg.norm(to_camera)
-            expected[k] = d > 0 and z <= d + 0.05 and cosine >= 0.2
-    settings = SETTINGS.model_copy(update={"cull_facing_cosine": 0.2})
-    kept = cull_unseen(ball, [frame], settings)
-    assert 100 < expected.sum() < 0.5 * len(expected)
-    # A face exactly on a pixel border may fall either way in float32.
-    assert abs(len(kept.faces) - expected.sum()) <= 2
+    mesh = extract_mesh(noise, LOW, HIGH, SETTINGS.model_copy(update={"min_component_m2": 0.0}))
+    assert len(mesh.faces) > 1e5 and (edges_by_count(mesh.faces) % 2 == 0).all()
 
 
 def test_small_pieces_are_dropped():

@@ -1,0 +1,37 @@
+"""The mesh that a run hands over: extracted near what was read, culled by what was seen, coloured from the views."""
+
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import numpy as np
+
+from active3d_pipe.export.config import MeshSettings
+from active3d_pipe.export.isosurface import drop_small_components, extract_mesh
+from active3d_pipe.export.view_fusion import colour_from_views, colour_mesh, cull_unseen, near_readings
+from active3d_pipe.structures import Frame, TriangleMesh
+
+
+class Surface(Protocol):
+    """What the mesh is made of: an SDF with colour over the box [low, high], world, m."""
+
+    low: np.ndarray
+    high: np.ndarray
+    query_sdf: Callable[[np.ndarray], np.ndarray]
+    query_color: Callable[[np.ndarray], np.ndarray]
+
+
+def final_mesh(field: Surface, frames: Sequence[Frame], settings: MeshSettings) -> TriangleMesh:
+    """The coloured mesh of a field, with the frames it was fitted to.
+
+    Args:
+        field: `query_sdf` ((N, 3) world m -> (N,) m, positive in free space) and `query_color` (-> (N, 3) in 0..1).
+        frames: logged frames with depth and colour; no surface is made far from their readings.
+        settings: see `MeshSettings`.
+    """
+    grid, observed = near_readings(frames, field.low, field.high, 2 * settings.voxel_size_m, settings.dilate_cells)
+    whole = settings.model_copy(update={"min_component_m2": 0.0})
+    mesh = extract_mesh(field.query_sdf, field.low, field.high, whole, grid=grid, observed=observed)
+    mesh = drop_small_components(cull_unseen(mesh, frames, settings), settings.min_component_m2)
+    if settings.colour == "views":
+        return colour_from_views(mesh, frames, settings, field.query_color)
+    return colour_mesh(mesh, field.query_color)

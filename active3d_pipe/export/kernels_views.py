@@ -1,0 +1,189 @@
+# mypy: ignore-errors
+"""What logged frames say of a surface: which cells hold readings, which faces were seen, what colour vertices have.
+
+Faces and vertices come in spatial order, so they are handled in chunks with a bounding sphere: a frame looks only at
+the chunks that its frustum meets. Every chunk is written by one task only, frames come one after another.
+`rotation` (3, 3) is camera -> world, `centre` (3,) m, `intrinsics` (fx, fy, cx, cy); all float32.
+"""
+
+import numpy as np
+from numba import njit, prange
+
+CHUNK = 1024  # faces or vertices that share a bounding sphere
+SPLIT_MAX = 8  # marks between two neighbouring readings of one surface
+
+
+@njit(parallel=True, cache=True)
+def bounding_spheres(points, spheres):
+    """spheres (C, 4) float32: centre of the bounding box and radius of each chunk of points (N, 3) float32."""
+    for c in prange(spheres.shape[0]):
+        first, last = c * CHUNK, min((c + 1) * CHUNK, points.shape[0])
+        radius = np.float32(0)
+        for d in range(3):
+            low, high = points[first, d], points[first, d]
+            for k in range(first, last):
+                low, high = min(low, points[k, d]), max(high, points[k, d])
+            spheres[c, d] = np.float32(0.5) * (low + high)
+        for k in range(first, last):
+            x, y, z = points[k, 0] - spheres[c, 0], points[k, 1] - spheres[c, 1], points[k, 2] - spheres[c, 2]
+            radius = max(radius, x * x + y * y + z * z)
+        spheres[c, 3] = np.sqrt(radius)
+
+
+@njit(cache=True)
+def _meets_frustum(sphere, rotation, centre, intrinsics, width, height, far):
+    dx, dy, dz = sphere[0] - centre[0], sphere[1] - centre[1], sphere[2] - centre[2]
+    x = rotation[0, 0] * dx + rotation[1, 0] * dy + rotation[2, 0] * dz
+    y = rotation[0, 1] * dx + rotation[1, 1] * dy + rotation[2, 1] * dz
+    z = rotation[0, 2] * dx + rotation[1, 2] * dy + rotation[2, 2] * dz
+    r = sphere[3]
+    if z < -r or z > far + r:
+        return False
+    # Tangents of the image's borders; a plane through the centre with tangent t has the normal (1, -t) / length.
+    right, left = (width - intrinsics[2]) / intrinsics[0], intrinsics[2] / intrinsics[0]
+    down, up = (height - intrinsics[3]) / intrinsics[1], intrinsics[3] / intrinsics[1]
+    return (
+        x - right * z <= r * np.sqrt(1 + right * right) and -x - left * z <= r * np.sqrt(1 + left * left)
+        and y - down * z <= r * np.sqrt(1 + down * down) and -y - up * z <= r * np.sqrt(1 + up * up)
+    )
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+def mark_seen(spheres, centroids, normals, rotation, centre, intrinsics, depth, near, far, tolerance, cosine, seen):
+    """Set seen[k] for the faces that the frame sees; `view_fusion.cull_unseen` explains what that means.
+
+    centroids, normals (F, 3) float32 world; depth (H, W) float32 m; seen (F,) bool; far: the deepest reading, m.
+    """
+    height, width = depth.shape
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    for c in prange(spheres.shape[0]):
+        if not _meets_frustum(spheres[c], rotation, centre, intrinsics, width, height, far + tolerance):
+            continue
+        for k in range(c * CHUNK, min((c + 1) * CHUNK, centroids.shape[0])):
+            if seen[k]:
+                continue
+            dx, dy, dz = centroids[k, 0] - centre[0], centroids[k, 1] - centre[1], centroids[k, 2] - centre[2]
+            z = rotation[0, 2] * dx + rotation[1, 2] * dy + rotation[2, 2] * dz
+            if z <= near:
+                continue
+            u = fx * (rotation[0, 0] * dx + rotation[1, 0] * dy + rotation[2, 0] * dz) / z + cx
+            v = fy * (rotation[0, 1] * dx + rotation[1, 1] * dy + rotation[2, 1] * dz) / z + cy
+            if u < 0 or v < 0 or u >= width or v >= height:
+                continue
+            d = depth[int(v), int(u)]
+            if d <= 0 or z > d + tolerance:
+                continue
+            towards = -(normals[k, 0] * dx + normals[k, 1] * dy + normals[k, 2] * dz)
+            if towards >= cosine * np.sqrt(dx * dx + dy * dy + dz * dz):
+                seen[k] = True
+
+
+@njit(cache=True)
+def grow_faces(faces, rings, num_vertices, seen):
+    """Add to seen (F,) bool the faces (F, 3) that touch it by a vertex, `rings` times."""
+    touched = np.zeros(num_vertices, np.bool_)
+    for _ in range(rings):
+        for f in range(faces.shape[0]):
+            if seen[f]:
+                for m in range(3):
+                    touched[faces[f, m]] = True
+        for f in range(faces.shape[0]):
+            seen[f] = touched[faces[f, 0]] or touched[faces[f, 1]] or touched[faces[f, 2]]
+
+
+@njit(fastmath=True, cache=True)
+def mark_readings(rotation, centre, intrinsics, depth, stride, join, low, inv_size, marks):
+    """Mark the cells of `marks` (X, Y, Z) bool, lowest corner `low` (3,), that a depth reading lies in.
+
+    Of `depth` (H, W) every `stride`-th pixel is read. Between neighbours whose depths differ by less than `join` of
+    their mean the line is marked too, so that a surface seen at a grazing angle leaves no gaps.
+    """
+    height, width = depth.shape
+    for i in range(0, height, stride):
+        for j in range(0, width, stride):
+            d = depth[i, j]
+            if d <= 0:
+                continue
+            x = (j + np.float32(0.5) - intrinsics[2]) / intrinsics[0] * d
+            y = (i + np.float32(0.5) - intrinsics[3]) / intrinsics[1] * d
+            for side in range(2):
+                i2, j2 = i + stride * side, j + stride * (1 - side)
+                pieces, x2, y2, d2 = 1, x, y, d
+                if i2 < height and j2 < width and abs(depth[i2, j2] - d) < join * d and depth[i2, j2] > 0:
+                    d2 = depth[i2, j2]
+                    x2 = (j2 + np.float32(0.5) - intrinsics[2]) / intrinsics[0] * d2
+                    y2 = (i2 + np.float32(0.5) - intrinsics[3]) / intrinsics[1] * d2
+                    gap = np.sqrt((x2 - x) ** 2 + (y2 - y) ** 2 + (d2 - d) ** 2)
+                    pieces = min(1 + int(gap * inv_size), SPLIT_MAX)
+                for p in range(pieces):
+                    s = np.float32(p) / pieces
+                    px, py, pz = x + s * (x2 - x), y + s * (y2 - y), d + s * (d2 - d)
+                    a = int(np.floor((rotation[0, 0] * px + rotation[0, 1] * py + rotation[0, 2] * pz + centre[0]
+                                      - low[0]) * inv_size))
+                    b = int(np.floor((rotation[1, 0] * px + rotation[1, 1] * py + rotation[1, 2] * pz + centre[1]
+                                      - low[1]) * inv_size))
+                    c = int(np.floor((rotation[2, 0] * px + rotation[2, 1] * py + rotation[2, 2] * pz + centre[2]
+                                      - low[2]) * inv_size))
+                    if 0 <= a < marks.shape[0] and 0 <= b < marks.shape[1] and 0 <= c < marks.shape[2]:
+                        marks[a, b, c] = True
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+def add_colours(
+    spheres, vertices, normals, rotation, centre, intrinsics, depth, rgb, near, far, tolerance, min_cosine, footprint,
+    reference, inv_variance, sums,
+):
+    """Add the frame's colours to `sums` (V, 4) float32: weighted r, g, b (0..255) and the weight.
+
+    vertices, normals (V, 3) float32 world; depth (H, W) float32 m, rgb (H, W, 3) uint8; a vertex is seen where all
+    four readings around it agree with its depth within `tolerance` (a share of the depth on top, for slanted surface)
+    and its normal has at least `min_cosine` towards the camera. Its weight is (cosine / distance)^2. The colour is the
+    mean of 2 x 2 bilinear samples over `footprint` m. With inv_variance > 0 a sample counts less the more it differs
+    from `reference` (V, 3).
+    """
+    height, width = depth.shape
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    for c in prange(spheres.shape[0]):
+        if not _meets_frustum(spheres[c], rotation, centre, intrinsics, width, height, far + tolerance):
+            continue
+        for k in range(c * CHUNK, min((c + 1) * CHUNK, vertices.shape[0])):
+            dx, dy, dz = vertices[k, 0] - centre[0], vertices[k, 1] - centre[1], vertices[k, 2] - centre[2]
+            z = rotation[0, 2] * dx + rotation[1, 2] * dy + rotation[2, 2] * dz
+            if z <= near:
+                continue
+            u = fx * (rotation[0, 0] * dx + rotation[1, 0] * dy + rotation[2, 0] * dz) / z + cx - np.float32(0.5)
+            v = fy * (rotation[0, 1] * dx + rotation[1, 1] * dy + rotation[2, 1] * dz) / z + cy - np.float32(0.5)
+            if u < 0 or v < 0 or u >= width - 1 or v >= height - 1:
+                continue
+            distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+            cosine = -(normals[k, 0] * dx + normals[k, 1] * dy + normals[k, 2] * dz) / distance
+            if cosine < min_cosine:
+                continue
+            i, j = int(v), int(u)
+            allowed = tolerance + 2 * z / (fx * cosine)
+            agree = True
+            for m in range(4):
+                d = depth[i + (m >> 1), j + (m & 1)]
+                agree = agree and d > 0 and abs(d - z) <= allowed
+            if not agree:
+                continue
+            reach = np.float32(0.25) * footprint * fx / z
+            r = g = b = np.float32(0)
+            for m in range(4):
+                su = min(max(u + reach * (2 * (m & 1) - 1), np.float32(0)), np.float32(width) - np.float32(1.001))
+                sv = min(max(v + reach * (2 * (m >> 1) - 1), np.float32(0)), np.float32(height) - np.float32(1.001))
+                i, j = int(sv), int(su)
+                a, e = sv - i, su - j
+                for n in range(4):
+                    w = (a if n >> 1 else 1 - a) * (e if n & 1 else 1 - e) * np.float32(0.25)
+                    r += w * rgb[i + (n >> 1), j + (n & 1), 0]
+                    g += w * rgb[i + (n >> 1), j + (n & 1), 1]
+                    b += w * rgb[i + (n >> 1), j + (n & 1), 2]
+            weight = (cosine / distance) ** 2
+            if inv_variance > 0:
+                e = (r - reference[k, 0]) ** 2 + (g - reference[k, 1]) ** 2 + (b - reference[k, 2]) ** 2
+                weight /= (1 + e * inv_variance) ** 2
+            sums[k, 0] += weight * r
+            sums[k, 1] += weight * g
+            sums[k, 2] += weight * b
+            sums[k, 3] += weight
