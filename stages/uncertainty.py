@@ -19,7 +19,7 @@ def _inputs(round: int) -> tuple[NodeId, ...]:
     return (*shared.captures(round), NodeId("mapping", round), *before)
 
 
-def _residuals(
+def residuals(
     hybrid: "HybridMap", frames: "Sequence[Frame]", stride: int, timings: dict[str, float], *, of_field: bool = False
 ) -> "list[ViewResidual]":
     """Errors of the map's renderings at the frames' poses, every `stride`-th pixel; the field's beside, if asked."""
@@ -35,7 +35,7 @@ def _residuals(
     return out
 
 
-def _examined(
+def examined_frames(
     hybrid: "HybridMap", frames: "Sequence[Frame]", previous: "UncertaintyVolume | None",
     settings: "UncertaintySettings",
 ) -> "list[Frame]":
@@ -67,9 +67,9 @@ def _run(context: StageContext) -> None:
         previous = volumes.read_volume(context.input("uncertainty", k - 1) / shared.VOLUME_NAME)
         before = shared.load_map(context.input("mapping", k - 1), context.inputs, config, to_train=False)
         ahead = frames[:: config.uncertainty.predict_every]
-        predicted = _residuals(before, ahead, config.uncertainty.render_stride, context.timings, of_field=True)
-    examined = _examined(hybrid, frames, previous, config.uncertainty)
-    views = _residuals(hybrid, examined, config.uncertainty.render_stride, context.timings)
+        predicted = residuals(before, ahead, config.uncertainty.render_stride, context.timings, of_field=True)
+    examined = examined_frames(hybrid, frames, previous, config.uncertainty)
+    views = residuals(hybrid, examined, config.uncertainty.render_stride, context.timings)
     start = time.perf_counter()
     volume = compute_volume(
         grid=grid, round=k, previous=previous, field_query=hybrid.field.query_geometry,

@@ -4,6 +4,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from active3d_pipe.information.entropy import bernoulli_entropy
+from active3d_pipe.uncertainty import kernels
 from active3d_pipe.uncertainty.config import UncertaintySettings
 
 
@@ -79,6 +80,8 @@ def implicit_entropy(
     1 where nothing was observed.
     """
     scale = np.maximum(sigma, np.float32(settings.sigma_floor_m))
-    area = np.interp((sdf + support) / scale, _Z, _INTEGRAL) - np.interp((sdf - support) / scale, _Z, _INTEGRAL)
-    h = np.clip(area * scale / (2 * support), 0, 1)
+    h = np.empty(sdf.shape, np.float32)
+    low, high = ((sdf + sign * support) / scale for sign in (np.float32(-1), np.float32(1)))
+    kernels.mean_between(low.ravel(), high.ravel(), _INTEGRAL, _Z[-1], h.reshape(-1))
+    np.clip(h, 0, 1, out=h)
     return (1 - observed * (1 - h)).astype(np.float32)

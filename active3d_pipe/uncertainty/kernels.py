@@ -175,9 +175,13 @@ def carve_frames(depths, cameras, poses, reaches, starts, stride, origin, inv_vo
 
 
 @njit(cache=True)
-def _scatter_view(residual, depth, camera, pose, start, stride, origin, inv_voxel, value, weight):
-    """Distribute the residuals of one view over the eight voxels around each observed point (trilinear)."""
+def _scatter_view(residual, depth, camera, pose, start, stride, origin, inv_voxel, value, weight, touched):
+    """Distribute the residuals of one view over the eight voxels around each observed point (trilinear).
+
+    Returns how many voxels have weight now; their flat ids are in `touched`.
+    """
     nx, ny, nz = value.shape
+    count = 0
     for i in range(depth.shape[0]):
         for j in range(depth.shape[1]):
             d = depth[i, j]
@@ -203,8 +207,14 @@ def _scatter_view(residual, depth, camera, pose, start, stride, origin, inv_voxe
                     for c in range(2):
                         if 0 <= z + c < nz:
                             w = wxy * (fz if c else np.float32(1.0) - fz)
+                            if w <= 0.0:
+                                continue
+                            if weight[x + a, y + b, z + c] == 0.0:
+                                touched[count] = ((x + a) * ny + y + b) * nz + z + c
+                                count += 1
                             value[x + a, y + b, z + c] += w * e
                             weight[x + a, y + b, z + c] += w
+    return count
 
 
 @njit(parallel=True, cache=True)
@@ -217,14 +227,16 @@ def backproject_views(residuals, depths, cameras, poses, start, stride, origin, 
     for c in prange(CHUNKS):
         value = np.zeros(total.shape[1:], np.float32)
         weight = np.zeros(total.shape[1:], np.float32)
+        touched = np.empty(min(value.size, 8 * depths.shape[1] * depths.shape[2]), np.int64)
         for v in range(c, depths.shape[0], CHUNKS):
             camera = (cameras[v, 0], cameras[v, 1], cameras[v, 2], cameras[v, 3])
-            _scatter_view(
-                residuals[v], depths[v], camera, poses[v], start, stride, origin, inv_voxel, value, weight
+            count = _scatter_view(
+                residuals[v], depths[v], camera, poses[v], start, stride, origin, inv_voxel, value, weight, touched
             )
             flat_value, flat_weight = value.ravel(), weight.ravel()
             flat_total, flat_views = total[c].ravel(), views[c].ravel()
-            for n in range(flat_value.size):
+            for t in range(count):
+                n = np.uintp(touched[t])
                 if flat_weight[n] >= min_weight:
                     flat_total[n] += flat_value[n] / flat_weight[n]
                     flat_views[n] += 1
@@ -349,3 +361,18 @@ def mark_vain(depth, camera, pose, reach, start, stride, origin, inv_voxel, rang
     for v in range(flat_stamp.size):
         if flat_stamp[v] == lost_id:
             flat_vain[v] = 1
+
+
+@njit(parallel=True, cache=True)
+def mean_between(low, high, table, reach, out):
+    """out = (I(high) - I(low)) / (high - low) for an integral I tabulated evenly over [-reach, reach], flat f32."""
+    last = table.size - 1
+    scale = last / (2.0 * reach)
+    for n in prange(out.size):
+        value = 0.0
+        for side in range(2):
+            z = min(max((low[n] if side == 0 else high[n]) + reach, 0.0), 2.0 * reach) * scale
+            i = min(int(z), last - 1)
+            at = table[i] + (z - i) * (table[i + 1] - table[i])
+            value += at if side == 1 else -at
+        out[n] = value / (high[n] - low[n])

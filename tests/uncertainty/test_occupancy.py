@@ -165,3 +165,19 @@ def test_an_opaque_sheet_has_about_unit_mass():
     mass = occupancy.opacity_mass(grid, sheet)
     np.testing.assert_allclose(mass[1:-1, 1:-1, 1], 1, atol=0.01)
     assert not mass[:, :, [0, 2]].any()
+
+
+def test_entropy_of_the_field_equals_numerical_integration():
+    from scipy.special import ndtr
+
+    from active3d_pipe.information.entropy import bernoulli_entropy
+    from active3d_pipe.uncertainty.implicit import implicit_entropy
+
+    rng = np.random.default_rng(5)
+    n, s = 64, UncertaintySettings()
+    sdf, sigma = rng.uniform(-0.1, 0.1, n).astype(np.float32), rng.uniform(0.001, 0.5, n).astype(np.float32)
+    support = rng.uniform(0.05, 0.087, n).astype(np.float32)
+    got = implicit_entropy(sdf, sigma, np.ones(n, np.float32), support, s)
+    along = sdf + support * np.linspace(-1, 1, 4001)[:, None]
+    expected = bernoulli_entropy(ndtr(along / np.maximum(sigma, s.sigma_floor_m))).mean(axis=0)
+    np.testing.assert_allclose(got, expected, atol=2e-3)
