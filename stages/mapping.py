@@ -39,4 +39,4 @@ def _run(context: StageContext) -> None:
     context.notes.update(report.numbers)
 
 
-STAGE = Stage(name="mapping", version=1, config=("mapping",), inputs=_inputs, run=_run, loop=True)
+STAGE = Stage(name="mapping", version=2, config=("mapping",), inputs=_inputs, run=_run, loop=True)

@@ -21,6 +21,7 @@ CACHE_BYTES = 1 << 30  # decoded frames kept in memory between the stages of one
 
 _frames: "OrderedDict[tuple, list[Frame]]" = OrderedDict()
 _simulators: "dict[str, Simulator]" = {}
+_newest_map: "list[tuple[tuple, HybridMap]]" = []  # at most one: what this process wrote last, and its files' identity
 
 
 def captures(last_round: int) -> tuple[NodeId, ...]:
@@ -125,13 +126,27 @@ def save_map(folder: Path, hybrid: "HybridMap") -> None:
     write_tensors(folder / "gaussians.safetensors", state["gaussians"])
     write_tensors(folder / "optimiser.safetensors", state["optimiser"])
     write_json(folder / "keyframes.json", [k.to_json() for k in hybrid.keyframes])
+    _newest_map[:] = [(_identity(folder), hybrid)]
+
+
+def _identity(folder: Path) -> tuple:
+    """What tells these files from all others, wherever their folder is moved; empty when one is missing."""
+    names = ("field.safetensors", "gaussians.safetensors", "optimiser.safetensors", "keyframes.json")
+    try:
+        stats = [(folder / name).stat() for name in names]
+    except OSError:
+        return ()
+    return tuple((s.st_dev, s.st_ino, s.st_mtime_ns, s.st_size) for s in stats)
 
 
 def load_map(folder: Path, inputs: Mapping[NodeId, Path], config: Any, *, to_train: bool = True) -> "HybridMap":
     """Read a map; its keyframes' images come from the capture logs among `inputs`.
 
-    Without `to_train` the optimiser's state, two thirds of the bytes, stays on disk.
+    Without `to_train` the optimiser's state, two thirds of the bytes, stays on disk. The map that this process wrote
+    last is taken from memory: its state is that of its files. Who loads it `to_train` owns it.
     """
+    if _newest_map and _newest_map[0][0] == _identity(folder) and _newest_map[0][1].settings == config.mapping:
+        return _newest_map.pop()[1] if to_train else _newest_map[0][1]
     from active3d_pipe.mapping.hybrid_map import HybridMap
     from active3d_pipe.mapping.keyframes import Keyframe
     from active3d_pipe.storage.files import read_json, read_tensors

@@ -15,6 +15,7 @@ from active3d_pipe.structures import Frame
 
 MIN_SLOPE = 0.1  # rays that graze a surface by less than about 6 degrees are taken at this slope
 REDRAWS = 3
+GROUP = 16  # rays are drawn in groups of one frame: gathering costs by the frame
 NEIGHBOURS = ((0, 1), (0, -1), (1, 0), (-1, 0))
 
 
@@ -55,12 +56,13 @@ def sample_rays(
         weights: (len(frames),) relative probabilities of the frames; uniform when None.
 
     Pixels without a depth reading are drawn anew up to `REDRAWS` times; what is still without one stays in the
-    batch with `valid` False. Rays come grouped by frame.
+    batch with `valid` False. Frames are drawn for groups of `GROUP` rays; the rays come sorted by frame.
     """
     if not frames:
         raise InputError("field: no frames to draw rays from; expected at least one key frame")
     p = None if weights is None else np.asarray(weights, dtype=np.float64) / np.sum(weights)
-    of_ray = np.sort(rng.choice(len(frames), size=count, p=p))
+    groups = rng.choice(len(frames), size=-(-count // GROUP), p=p)
+    of_ray = np.sort(np.repeat(groups, GROUP)[:count])
     draws = rng.random((count, 1 + REDRAWS), dtype=np.float32)
     taken, first, per_frame = np.unique(of_ray, return_index=True, return_counts=True)
     # Only the gathering runs frame by frame; the arithmetic is done once for the whole batch.

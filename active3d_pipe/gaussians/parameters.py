@@ -101,13 +101,29 @@ class GaussianParameters:
         self.values = self.values.detach()[kept]
         self.moment1, self.moment2, self.steps = self.moment1[kept], self.moment2[kept], self.steps[kept]
 
+    def split(self, mask: np.ndarray) -> "GaussianParameters":
+        """Keep the primitives where `mask` (N,) bool is True and return the others; `join` puts both together."""
+        out = torch.from_numpy(np.flatnonzero(~mask))
+        others = GaussianParameters(
+            self.values.detach()[out], self.moment1[out], self.moment2[out], self.steps[out]
+        )
+        self.keep(mask)
+        return others
+
+    def join(self, others: "GaussianParameters") -> None:
+        """Put `others` in front of these primitives, optimiser state included."""
+        self.values = torch.cat([others.values, self.values.detach()])
+        self.moment1 = torch.cat([others.moment1, self.moment1])
+        self.moment2 = torch.cat([others.moment2, self.moment2])
+        self.steps = torch.cat([others.steps, self.steps])
+
     def state(self) -> dict[str, np.ndarray]:
-        """Everything a later `from_state` needs to go on with the same bytes."""
+        """Everything a later `from_state` needs to go on with the same bytes; views, valid until the next step."""
         return {
-            "values": self.values.detach().numpy().copy(),
-            "moment1": self.moment1.numpy().copy(),
-            "moment2": self.moment2.numpy().copy(),
-            "steps": self.steps.numpy().copy(),
+            "values": self.values.detach().numpy(),
+            "moment1": self.moment1.numpy(),
+            "moment2": self.moment2.numpy(),
+            "steps": self.steps.numpy(),
         }
 
     @classmethod

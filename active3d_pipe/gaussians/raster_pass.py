@@ -124,6 +124,17 @@ class RasterPass:
         )
         return grad
 
+    def project(self, values: np.ndarray, camera: Camera, T_world_camera: np.ndarray) -> np.ndarray:
+        """(N,) bool, the primitives of `values` (N, 14) that the view shows; nothing is drawn."""
+        n, get = len(values), self.workspace.get
+        counts, ids = get("counts", (CHUNKS,), np.int64), get("ids", (n,), np.int32)
+        R, t, view = view_arrays(camera, T_world_camera)
+        kernels_projection.project(
+            values, R, t, view, TILE_SIZE, tile_grid(camera), CHUNKS, np.float32(self.dilation_px2), self.compensate,
+            get("rec", (n, 16), np.float32), ids, get("box", (n, 4), np.int16), counts,
+        )
+        return _mask(ids, counts, n)
+
     @property
     def num_visible(self) -> int:
         """Number of primitives that the last `forward` projected onto a drawn image."""
@@ -132,12 +143,16 @@ class RasterPass:
     def visible(self) -> np.ndarray:
         """(N,) bool, primitives that the last `forward` projected onto a drawn image."""
         s = self._state
-        n = len(s["values"])
-        mask = np.zeros(n, bool)
-        for c in range(CHUNKS):
-            start = n * c // CHUNKS
-            mask[s["ids"][start : start + s["counts"][c]]] = True
-        return mask
+        return _mask(s["ids"], s["counts"], len(s["values"]))
+
+
+def _mask(ids: np.ndarray, counts: np.ndarray, n: int) -> np.ndarray:
+    """(n,) bool, True for the primitives behind the records of every chunk."""
+    mask = np.zeros(n, bool)
+    for c in range(CHUNKS):
+        start = n * c // CHUNKS
+        mask[ids[start : start + counts[c]]] = True
+    return mask
 
 
 def tile_grid(camera: Camera) -> tuple[int, int]:

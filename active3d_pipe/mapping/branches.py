@@ -42,7 +42,7 @@ def unit_rgb(frame: Frame) -> np.ndarray:
 def seed(hybrid: HybridMap, frame: Frame, rng: np.random.Generator, clock: Clock) -> int:
     """Insert primitives where the frame shows surface that the map does not render; returns their number."""
     settings = hybrid.settings.gaussians
-    room = settings.max_count - len(hybrid.gaussians)
+    room = settings.max_count - hybrid.num_gaussians
     if room <= 0:
         return 0
     with clock.of("seeding"):
@@ -102,7 +102,7 @@ def add_where_wrong(
 ) -> int:
     """Error-driven adding on one frame; returns the number of new primitives."""
     settings = hybrid.settings.gaussians
-    most = min(most, settings.max_count - len(hybrid.gaussians))
+    most = min(most, settings.max_count - hybrid.num_gaussians)
     if most <= 0:
         return 0
     with clock.of("adding"):

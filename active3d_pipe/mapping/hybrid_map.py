@@ -1,6 +1,7 @@
 """The hybrid scene state M_k = {F_theta, G_k} (paper, eq. hybrid_state) with all that a resume needs."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 import torch
@@ -8,10 +9,11 @@ import torch
 from active3d_pipe.field.optimise import FieldOptimiser
 from active3d_pipe.field.sdf_field import SdfField
 from active3d_pipe.gaussians.parameters import GaussianParameters
+from active3d_pipe.gaussians.raster_pass import RasterPass
 from active3d_pipe.gaussians.rasteriser import RenderedView, render_view
 from active3d_pipe.mapping.config import MappingSettings
 from active3d_pipe.mapping.keyframes import Keyframe
-from active3d_pipe.structures import Camera, GaussianModel
+from active3d_pipe.structures import Camera, Frame, GaussianModel
 
 FIELD_MARGIN_M = 0.2  # the field's box reaches beyond the scene's, so that walls at its border have two sides
 OPTIMISER_PREFIXES = ("field.", "gaussians.")
@@ -29,6 +31,33 @@ class HybridMap:
         self.gaussians = gaussians
         self.settings = settings
         self.keyframes = list(keyframes)
+        self._resting: GaussianParameters | None = None
+
+    @property
+    def num_gaussians(self) -> int:
+        """Primitives of the map, those outside the working set included."""
+        return len(self.gaussians) + (len(self._resting) if self._resting is not None else 0)
+
+    @contextmanager
+    def working_set(self, frames: Sequence[Frame]) -> Iterator[None]:
+        """Inside, `gaussians` holds only what `frames` see, so that an iteration costs what is near, not the scene.
+
+        Views of other frames are incomplete meanwhile. Primitives that rest keep their optimiser state.
+        """
+        settings, values = self.settings.gaussians, self.gaussians.values.numpy()
+        raster = RasterPass(
+            dilation_px2=settings.dilation_px2, compensate=settings.opacity_compensation,
+            workspace=self.gaussians.workspace,
+        )
+        seen = np.zeros(len(values), bool)
+        for frame in frames:
+            seen |= raster.project(values, frame.camera, frame.T_world_camera)
+        self._resting = self.gaussians.split(seen)
+        try:
+            yield
+        finally:
+            self.gaussians.join(self._resting)
+            self._resting = None
 
     @classmethod
     def create(

@@ -12,6 +12,7 @@ from active3d_pipe.structures import Camera, Frame, UncertaintyVolume
 
 OVERLAP_STRIDE = 24  # px between the depth samples that measure frustum overlap
 OCCLUSION_TOLERANCE = 0.1  # relative depth difference at which a sample counts as hidden from the keyframe
+NEAR_FIRST = 0.2  # 1/m, how much the distance of its centre delays a keyframe in the search for the nearest view
 BITS_PER_VOXEL_FLOOR = 0.02  # entropy below which a voxel has nothing left to tell
 
 
@@ -67,10 +68,28 @@ def view_distance(frame: Frame, points_world: np.ndarray, other: Frame) -> float
     return 0.5 * angular + 0.5 * (1 - overlap(points_world, other))
 
 
-def divergence(frame: Frame, keyframes: Sequence[Keyframe]) -> float:
-    """delta_c: least view distance to any keyframe; 1 when there is none."""
+def divergence(frame: Frame, keyframes: Sequence[Keyframe], enough: float = 0.0) -> float:
+    """delta_c: least view distance to any keyframe; 1 when there is none.
+
+    The search ends early once a distance of at most `enough` is found. Keyframes are visited in the order of their
+    angle to the frame: half the angular term bounds the distance from below, so most are never compared.
+    """
+    if not keyframes:
+        return 1.0
     points = depth_samples(frame)
-    return min((view_distance(frame, points, k.frame) for k in keyframes), default=1.0)
+    rotations = np.stack([k.frame.T_world_camera[:3, :3] for k in keyframes])
+    centres = np.stack([k.frame.T_world_camera[:3, 3] for k in keyframes])
+    cosine = (np.einsum("ij,kij->k", frame.T_world_camera[:3, :3], rotations) - 1) / 2
+    least = 0.5 * np.minimum(np.arccos(np.clip(cosine, -1, 1)) / horizontal_fov(frame.camera), 1.0)
+    apart = np.linalg.norm(centres - frame.T_world_camera[:3, 3], axis=1)
+    found = 1.0
+    for i in np.argsort(least + NEAR_FIRST * apart, kind="stable"):
+        # The slack keeps rounding of the bound from cutting off the nearest one.
+        if least[i] - 1e-6 < found:
+            found = min(found, view_distance(frame, points, keyframes[i].frame))
+            if found <= enough:
+                break
+    return found
 
 
 class Information:
@@ -120,7 +139,7 @@ def select_keyframes(
             if not known or frame.step - known[-1].frame.step >= settings.every_n:
                 known.append(Keyframe(frame, round, "every_n", 1.0, 0.0, 0.0))
             continue
-        delta = divergence(frame, known)
+        delta = divergence(frame, known, settings.tau_view)
         if delta <= settings.tau_view:
             continue
         if information is None:

@@ -11,10 +11,11 @@ from active3d_pipe.mapping import branches
 from active3d_pipe.mapping.config import MappingSettings
 from active3d_pipe.mapping.hybrid_map import HybridMap
 from active3d_pipe.mapping.keyframes import select_keyframes
-from active3d_pipe.mapping.window import choose_window, draw_keyframe
+from active3d_pipe.mapping.window import choose_window, draw_keyframe, draw_older
 from active3d_pipe.structures import Frame, UncertaintyVolume
 
 PRUNE_EVERY = 100  # iterations
+OTHERS_LOOKED_AT = 3  # keyframes of the window, beside the new ones, that error-driven adding looks at in a round
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,17 +51,23 @@ def update_map(
         window = choose_window(hybrid.keyframes, new, settings.window)
 
     factor = settings.first_round_factor if round == 0 else 1.0
-    iterations = round_up(factor * settings.field_iterations_per_step * len(frames))
+    iterations = round_up(
+        factor * (settings.field_iterations_per_step * len(frames) + settings.field_iterations_per_keyframe * len(new))
+    )
     field_loss = _field(hybrid, len(new), iterations, rng, clock)
     progress("field trained")
 
     seeded = sum(branches.seed(hybrid, k.frame, rng, clock) for k in new)
-    iterations = round_up(factor * settings.gaussian_iterations_per_step * len(frames))
-    psnr, added, pruned = _gaussians(hybrid, window, iterations, rng, clock, progress)
+    older = draw_older(rng, window, len(hybrid.keyframes), settings.window)
+    iterations = round_up(factor * (
+        settings.gaussian_iterations_per_step * len(frames) + settings.gaussian_iterations_per_keyframe * len(new)
+    ))
+    with hybrid.working_set([hybrid.keyframes[i].frame for i in [*window, *older]]):
+        psnr, added, pruned = _gaussians(hybrid, window, older, len(new), iterations, rng, clock, progress)
 
     numbers = {
         "keyframes": len(hybrid.keyframes), "new_keyframes": len(new), "window": len(window),
-        "gaussians": len(hybrid.gaussians), "seeded": seeded, "added": added, "pruned": pruned,
+        "gaussians": hybrid.num_gaussians, "seeded": seeded, "added": added, "pruned": pruned,
         "psnr_window": round_number(psnr), "field_loss": round_number(field_loss),
     }
     return UpdateReport(numbers, dict(clock.seconds))
@@ -90,21 +97,23 @@ def _field(hybrid: HybridMap, num_new: int, iterations: int, rng: np.random.Gene
 
 
 def _gaussians(
-    hybrid: HybridMap, window: Sequence[int], iterations: int, rng: np.random.Generator, clock: branches.Clock,
-    progress: Callable[[str], None],
+    hybrid: HybridMap, window: Sequence[int], older: Sequence[int], num_new: int, iterations: int,
+    rng: np.random.Generator, clock: branches.Clock, progress: Callable[[str], None],
 ) -> tuple[float, int, int]:
     """Train the explicit branch over the window; returns (mean PSNR of the last pass, added, pruned)."""
     settings = hybrid.settings
     coupled = settings.representation == "hybrid"
     scores: list[float] = []
     added = pruned = 0
-    # Adding looks at every frame of the window once, in the first two thirds, so that what is new still settles.
-    adding = {int(i * iterations * 0.66 / max(len(window), 1)): index for i, index in enumerate(window)}
+    # Adding looks once at every new keyframe and at some of the others, in the first two thirds of the iterations, so
+    # that what is new still settles.
+    looked_at = window[-(num_new + OTHERS_LOOKED_AT) :]
+    adding = {int(i * iterations * 0.66 / max(len(looked_at), 1)): index for i, index in enumerate(looked_at)}
     for i in range(iterations):
         if i in adding:
             frame = hybrid.keyframes[adding[i]].frame
-            added += branches.add_where_wrong(hybrid, frame, settings.add_per_round // len(window), rng, clock)
-        index = draw_keyframe(rng, window, len(hybrid.keyframes), settings.window.replay)
+            added += branches.add_where_wrong(hybrid, frame, settings.add_per_round // len(looked_at), rng, clock)
+        index = draw_keyframe(rng, window, older, settings.window.replay)
         pull = None
         if coupled and i % settings.coupling_every == settings.coupling_every - 1:
             pull = branches.coupling_gradient(hybrid, rng, clock)

@@ -28,8 +28,15 @@ def choose_window(keyframes: Sequence[Keyframe], newest: Sequence[Keyframe], set
     return chosen
 
 
-def draw_keyframe(rng: np.random.Generator, window: Sequence[int], count: int, replay: float) -> int:
-    """Index of the keyframe of the next iteration: from the window, or with probability `replay` any older one."""
-    if len(window) < count and rng.random() < replay:
-        return int(rng.integers(count))
+def draw_older(rng: np.random.Generator, window: Sequence[int], count: int, settings: WindowSettings) -> list[int]:
+    """Indices of the keyframes outside the window that are replayed in this round (E_reg): against forgetting."""
+    outside = np.setdiff1d(np.arange(count), window)
+    most = min(len(outside), int(np.ceil(settings.replay * settings.size)))
+    return sorted(int(i) for i in rng.choice(outside, size=most, replace=False)) if most else []
+
+
+def draw_keyframe(rng: np.random.Generator, window: Sequence[int], older: Sequence[int], replay: float) -> int:
+    """Index of the keyframe of the next iteration: from the window, or with probability `replay` an older one."""
+    if older and rng.random() < replay:
+        return int(older[int(rng.integers(len(older)))])
     return int(window[int(rng.integers(len(window)))])

@@ -1,0 +1,125 @@
+"""A round of mapping on an analytic room: keyframes, window, working set, and the same bytes after a resume."""
+
+import numpy as np
+import pytest
+from room_with_ball import HIGH, LOW, render
+
+from active3d_pipe.geometry import se3
+from active3d_pipe.mapping.config import MappingSettings
+from active3d_pipe.mapping.hybrid_map import HybridMap
+from active3d_pipe.mapping.keyframes import Keyframe, depth_samples, divergence, select_keyframes, view_distance
+from active3d_pipe.mapping.refine import refine
+from active3d_pipe.mapping.update import update_map
+from active3d_pipe.mapping.window import choose_window, draw_older
+from active3d_pipe.structures import Camera
+
+CAMERA = Camera.from_fov(96, 64, 80.0)
+SETTINGS = MappingSettings.model_validate(
+    {"refinement_iterations": 20, "refinement_field_iterations": 3, "field": {"rays": 128, "prior_points": 32}}
+)
+
+
+def pose(yaw_deg: float, position=(-0.5, 0.6, 0.9)) -> np.ndarray:
+    yaw = np.radians(yaw_deg)
+    forward = np.array([np.cos(yaw), np.sin(yaw), -0.1])
+    return se3.look_at(np.asarray(position), np.asarray(position) + forward)
+
+
+def frames_between(first: int, last: int, turn_deg: float = 10.0) -> list:
+    return [render(CAMERA, pose(turn_deg * i), step=i) for i in range(first, last)]
+
+
+def keyframe(frame, round: int = 0) -> Keyframe:
+    return Keyframe(frame, round, "viewpoint", 1.0, 0.0, 0.0)
+
+
+def grown(rounds: int = 2) -> HybridMap:
+    hybrid = HybridMap.create(LOW, HIGH, SETTINGS, np.random.default_rng(0))
+    for k in range(rounds):
+        frames = frames_between(6 * k, 6 * (k + 1), 25.0)
+        update_map(hybrid, frames, None, k, SETTINGS, np.random.default_rng(k), lambda _: None)
+    return hybrid
+
+
+def all_bytes(hybrid: HybridMap) -> dict[str, bytes]:
+    return {f"{t}.{n}": a.tobytes() for t, arrays in hybrid.state().items() for n, a in arrays.items()}
+
+
+def test_divergence_is_the_least_view_distance() -> None:
+    known = [keyframe(f) for f in frames_between(0, 12, 31.0)]
+    for frame in (render(CAMERA, pose(17.0)), render(CAMERA, pose(100.0, (0.5, -0.8, 0.5)))):
+        points = depth_samples(frame, 24)
+        slow = min(view_distance(frame, points, k.frame) for k in known)
+        assert divergence(frame, known) == pytest.approx(slow, abs=1e-12)
+    assert divergence(known[3].frame, known, enough=0.2) <= 0.2
+    assert divergence(known[3].frame, []) == 1.0
+
+
+def test_select_keyframes_takes_what_diverges_and_nothing_twice() -> None:
+    frames = frames_between(0, 18, 8.0)
+    chosen = select_keyframes(frames, [], None, 0, SETTINGS.keyframes)
+    assert chosen[0].frame is frames[0] and 3 <= len(chosen) < len(frames)
+    assert select_keyframes(frames, chosen, None, 1, SETTINGS.keyframes) == []
+    every = SETTINGS.keyframes.model_copy(update={"policy": "every_n", "every_n": 5})
+    assert [k.frame.step for k in select_keyframes(frames, [], None, 0, every)] == [0, 5, 10, 15]
+
+
+def test_window_holds_the_newest_and_their_neighbours_and_replay_the_others() -> None:
+    known = [keyframe(f) for f in frames_between(0, 36, 10.0)]
+    settings = SETTINGS.window.model_copy(update={"size": 6})
+    window = choose_window(known, known[-2:], settings)
+    # The camera has turned full circle: the neighbours of the last views are the first ones.
+    assert {34, 35} <= set(window) and min(window) < 3 and len(window) == 6
+    older = draw_older(np.random.default_rng(0), window, len(known), settings)
+    assert len(older) == 2 and not set(older) & set(window)
+    assert draw_older(np.random.default_rng(0), range(len(known)), len(known), settings) == []
+
+
+def test_working_set_changes_neither_number_nor_state_of_the_rest() -> None:
+    hybrid = grown()
+    before = {row.tobytes() for row in hybrid.gaussians.values.numpy()}
+    frame = hybrid.keyframes[0].frame
+    with hybrid.working_set([frame]):
+        inside = len(hybrid.gaussians)
+        assert 0 < inside < hybrid.num_gaussians == len(before)
+        part = hybrid.render(frame.camera, frame.T_world_camera)
+    whole = hybrid.render(frame.camera, frame.T_world_camera)
+    assert len(hybrid.gaussians) == hybrid.num_gaussians == len(before)
+    assert {row.tobytes() for row in hybrid.gaussians.values.numpy()} == before
+    assert np.abs(part.rgb - whole.rgb).max() < 1e-5 and np.abs(part.alpha - whole.alpha).max() < 1e-5
+
+
+def test_resting_primitives_keep_their_bytes_while_others_train() -> None:
+    hybrid = grown(1)
+    rows = {row.tobytes() for row in hybrid.gaussians.values.numpy()}
+    frames = frames_between(0, 1)
+    raster_seen = len(rows)
+    settings = SETTINGS.model_copy(update={"window": SETTINGS.window.model_copy(update={"replay": 0.0, "size": 1})})
+    hybrid.settings = settings
+    hybrid.keyframes = hybrid.keyframes[:1]
+    update_map(hybrid, frames, None, 1, settings, np.random.default_rng(5), lambda _: None)
+    kept = sum(row.tobytes() in rows for row in hybrid.gaussians.values.numpy())
+    assert 0 < kept < raster_seen
+
+
+def test_a_map_from_its_state_goes_on_with_the_same_bytes() -> None:
+    straight, stopped = grown(1), grown(1)
+    state = {t: {n: a.copy() for n, a in arrays.items()} for t, arrays in stopped.state().items()}
+    resumed = HybridMap.from_state(LOW, HIGH, SETTINGS, state, stopped.keyframes)
+    frames = frames_between(6, 12, 25.0)
+    for hybrid in (straight, resumed):
+        update_map(hybrid, frames, None, 1, SETTINGS, np.random.default_rng(1), lambda _: None)
+        refine(hybrid, frames, np.random.default_rng(2), lambda _: None)
+    assert all_bytes(straight) == all_bytes(resumed)
+
+
+def test_a_round_teaches_both_branches_what_the_frames_show() -> None:
+    hybrid = grown(2)
+    frame = hybrid.keyframes[-1].frame
+    view = hybrid.render(frame.camera, frame.T_world_camera)
+    shown = view.alpha > 0.5
+    assert shown.mean() > 0.95
+    assert np.median(np.abs(view.depth - frame.depth)[shown]) < 0.03
+    assert np.abs(view.rgb - frame.rgb / 255.0)[shown].mean() < 0.06
+    points = depth_samples(frame, 4).astype(np.float32)
+    assert np.median(np.abs(hybrid.field.query_sdf(points))) < 0.05
