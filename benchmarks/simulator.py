@@ -23,7 +23,8 @@ from active3d_pipe.storage import capture_log
 
 SUPERSAMPLING = 6
 HEAD = [
-    "scene", "render min ms", "render median ms", "PSNR mean dB", "PSNR worst dB", "log ms", "read ms", "MB / 100 frames",
+    "scene", "render min ms", "render median ms", "PSNR mean dB", "PSNR worst dB", "log ms", "read ms",
+    "MB / 100 frames",
 ]
 
 

@@ -18,7 +18,7 @@ def _inputs(round: int) -> tuple[NodeId, ...]:
 
 
 def _parameters(config: Any, inputs: Mapping[NodeId, Path]) -> dict[str, Any]:
-    """The scene's name and digest, and how many steps this round may take: the budget enters the key only where it binds."""
+    """The scene's name and digest, and how many steps this round may take (the budget counts only where it binds)."""
     from active3d_pipe.sim.digest import scene_name, source_digest
     from active3d_pipe.storage.files import read_json
 

@@ -43,11 +43,11 @@ class CameraSettings(Settings):
 class SensorSettings(Settings):
     """How the scene is rendered and what the depth sensor does to the true depth."""
 
-    backend: Literal["raycast", "pyrender"] = Field(
-        "raycast", description="renderer: raycast (Open3D) or pyrender (EGL)"
+    backend: Literal["raster", "raycast", "pyrender"] = Field(
+        "raycast", description="renderer: raster (scan conversion, fastest), raycast (Open3D) or pyrender (EGL)"
     )
     edge_samples: int = Field(
-        10, ge=0, le=64, description="colour samples of a pixel that holds an edge; 0 = no supersampling"
+        14, ge=0, le=64, description="colour samples of a pixel that holds an edge; 0 = no supersampling"
     )
     depth_noise_base_m: float = Field(0.0, ge=0, description="constant part of the depth noise's standard deviation, m")
     depth_noise_per_m2: float = Field(

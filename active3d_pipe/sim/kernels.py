@@ -286,23 +286,3 @@ def sample_rays(pixels, offsets, width, T, inv_fx, inv_fy, cx, cy, rays):
             for c in range(3):
                 rays[n, c] = T[c, 3]
                 rays[n, 3 + c] = T[c, 0] * x + T[c, 1] * y + T[c, 2]
-
-
-@njit(parallel=True, fastmath=True, cache=True)
-def sum_samples(samples, centre, total, spread):
-    """Sum (P, 3) of each pixel's samples (P, K, 3), and spread (P,), the largest range over the channels, 0..255.
-
-    `centre` (P, 3), the sample at the pixel's centre, counts for the spread alone.
-    """
-    for p in prange(len(samples)):
-        widest = _ZERO
-        for c in range(3):
-            low = high = centre[p, c]
-            value = _ZERO
-            for s in range(samples.shape[1]):
-                x = samples[p, s, c]
-                value += x
-                low, high = min(low, x), max(high, x)
-            total[p, c] = value
-            widest = max(widest, high - low)
-        spread[p] = widest

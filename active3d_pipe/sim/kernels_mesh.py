@@ -26,23 +26,19 @@ def plane_hits(rays, face, vertices, faces, t, bary):
             bary[n, 1] = _ZERO
             continue
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        e1 = np.empty(3)
-        e2 = np.empty(3)
-        s = np.empty(3)
-        d = np.empty(3)
-        for k in range(3):
-            e1[k] = float(vertices[b, k]) - float(vertices[a, k])
-            e2[k] = float(vertices[c, k]) - float(vertices[a, k])
-            s[k] = float(rays[n, k]) - float(vertices[a, k])
-            d[k] = float(rays[n, 3 + k])
-        px, py, pz = d[1] * e2[2] - d[2] * e2[1], d[2] * e2[0] - d[0] * e2[2], d[0] * e2[1] - d[1] * e2[0]
-        det = e1[0] * px + e1[1] * py + e1[2] * pz
+        ax, ay, az = float(vertices[a, 0]), float(vertices[a, 1]), float(vertices[a, 2])
+        e1x, e1y, e1z = vertices[b, 0] - ax, vertices[b, 1] - ay, vertices[b, 2] - az
+        e2x, e2y, e2z = vertices[c, 0] - ax, vertices[c, 1] - ay, vertices[c, 2] - az
+        sx, sy, sz = rays[n, 0] - ax, rays[n, 1] - ay, rays[n, 2] - az
+        dx, dy, dz = float(rays[n, 3]), float(rays[n, 4]), float(rays[n, 5])
+        px, py, pz = dy * e2z - dz * e2y, dz * e2x - dx * e2z, dx * e2y - dy * e2x
+        det = e1x * px + e1y * py + e1z * pz
         if abs(det) < 1e-18:
             det = 1e-18
-        qx, qy, qz = s[1] * e1[2] - s[2] * e1[1], s[2] * e1[0] - s[0] * e1[2], s[0] * e1[1] - s[1] * e1[0]
-        u = (s[0] * px + s[1] * py + s[2] * pz) / det
-        v = (d[0] * qx + d[1] * qy + d[2] * qz) / det
-        t[n] = (e2[0] * qx + e2[1] * qy + e2[2] * qz) / det
+        qx, qy, qz = sy * e1z - sz * e1y, sz * e1x - sx * e1z, sx * e1y - sy * e1x
+        inv = 1.0 / det
+        u, v = (sx * px + sy * py + sz * pz) * inv, (dx * qx + dy * qy + dz * qz) * inv
+        t[n] = (e2x * qx + e2y * qy + e2z * qz) * inv
         bary[n, 0] = min(max(u, 0.0), 1.0)
         bary[n, 1] = min(max(v, 0.0), 1.0 - bary[n, 0])
 

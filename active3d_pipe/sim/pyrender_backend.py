@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from active3d_pipe.errors import Active3dError, ConfigError
-from active3d_pipe.sim import kernels, kernels_mesh
+from active3d_pipe.sim import kernels
 from active3d_pipe.sim.config import SensorSettings
 from active3d_pipe.sim.rendering import Hits, SurfaceRenderer
 from active3d_pipe.sim.scene import Scene
@@ -135,13 +135,14 @@ class PyrenderSimulator(SurfaceRenderer):
         faces = [seen[_GRID // 2 :: _GRID, _GRID // 2 :: _GRID].reshape(-1) for seen in self._faces_seen(T)]
         return self._resolve(self._rays(T, self._all_pixels, self._centres), faces)
 
-    def _samples(self, T: np.ndarray, pixels: np.ndarray, part: int) -> tuple[Hits, int]:
+    def _samples(self, T: np.ndarray, pixels: np.ndarray, part: int) -> tuple[np.ndarray, np.ndarray]:
         height, width = self._camera.height, self._camera.width
         faces = [
             seen.reshape(height, _GRID, width, _GRID).transpose(0, 2, 1, 3).reshape(-1, _GRID**2)[pixels].reshape(-1)
             for seen in self._faces_seen(T)
         ]
-        return self._resolve(self._rays(T, pixels, self._offsets), faces), _GRID * _GRID
+        hits = self._resolve(self._rays(T, pixels, self._offsets), faces)
+        return hits.face.reshape(len(pixels), -1), self._offsets
 
     def _resolve(self, rays: np.ndarray, faces: list[np.ndarray]) -> Hits:
         """Hits of rays whose faces the rasteriser found: of the first pass, and of the second where that is a hole."""
@@ -151,9 +152,3 @@ class PyrenderSimulator(SurfaceRenderer):
             behind = faces[1] if len(faces) > 1 else np.full_like(faces[0], kernels.NO_HIT)
             hits = self._on_planes(rays, np.where(hole, behind, faces[0]))
         return hits
-
-    def _on_planes(self, rays: np.ndarray, face: np.ndarray) -> Hits:
-        face = np.ascontiguousarray(face)
-        t, bary = np.empty(len(face), np.float32), np.empty((len(face), 2), np.float32)
-        kernels_mesh.plane_hits(rays, face, self._packed.arrays[0], self._packed.arrays[1], t, bary)
-        return Hits(rays, t, face, bary)

@@ -3,6 +3,7 @@
 import numpy as np
 
 from active3d_pipe.sim.config import SensorSettings
+from active3d_pipe.sim.patterns import low_discrepancy_offsets
 from active3d_pipe.sim.rendering import Hits, SurfaceRenderer
 from active3d_pipe.sim.scene import Scene
 from active3d_pipe.structures import Camera
@@ -23,9 +24,9 @@ class RaycastSimulator(SurfaceRenderer):
     def _primary(self, T: np.ndarray) -> Hits:
         return self._cast(self._rays(T, self._all_pixels, self._centres))
 
-    def _samples(self, T: np.ndarray, pixels: np.ndarray, part: int) -> tuple[Hits, int]:
+    def _samples(self, T: np.ndarray, pixels: np.ndarray, part: int) -> tuple[np.ndarray, np.ndarray]:
         offsets = self._offsets[part]
-        return self._cast(self._rays(T, pixels, offsets)), len(offsets)
+        return self._cast(self._rays(T, pixels, offsets)).face.reshape(len(pixels), -1), offsets
 
     def top_view(self, cut_z: float, longest_side: int = 900) -> np.ndarray:
         """(H, W, 3) uint8 picture of the bounds from far above, +y upwards, without what lies over z = `cut_z`."""
@@ -62,23 +63,3 @@ class RaycastSimulator(SurfaceRenderer):
             hits.t[todo], hits.face[todo], hits.bary[todo] = more.t + skipped, more.face, more.bary
             todo = todo[self._holes(more)]
         return hits
-
-
-def low_discrepancy_offsets(count: int) -> np.ndarray:
-    """(count, 2) float64 points in the unit square: a rank-1 lattice, every row and column of count cells hit once.
-
-    The generator is the odd step that spreads the points best (largest smallest distance on the torus).
-    """
-    if count <= 0:
-        return np.zeros((0, 2))
-    i = np.arange(count)
-    best, widest = np.zeros((count, 2)), -1.0
-    for step in range(1, count + 1):
-        if np.gcd(step, count) != 1:
-            continue
-        points = np.stack([(i + 0.5) / count, ((i * step) % count + 0.5) / count], axis=-1)
-        delta = np.abs(points[:, None] - points[None])
-        distance = np.linalg.norm(np.minimum(delta, 1 - delta), axis=-1) + 2 * np.eye(count)
-        if distance.min() > widest:
-            best, widest = points, float(distance.min())
-    return best

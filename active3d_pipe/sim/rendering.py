@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from active3d_pipe.geometry.raycasting import SurfaceIndex
-from active3d_pipe.sim import kernels, kernels_mesh, noise, shading
+from active3d_pipe.sim import kernels, kernels_edges, kernels_mesh, noise, shading
 from active3d_pipe.sim.config import SensorSettings
 from active3d_pipe.sim.scene import Scene
 from active3d_pipe.structures import Camera, Frame, check_pose
@@ -32,7 +32,8 @@ class SurfaceRenderer(ABC):
     """A `Simulator` over a triangle scene.
 
     Colour: one sample at the pixel centre with the texture filtered over the pixel's footprint; pixels at an edge of
-    geometry or material are averaged over further samples instead. Depth: exact at the pixel centre.
+    geometry or material are averaged over further samples instead, shaded once for every face among them. Depth: exact
+    at the pixel centre.
     """
 
     _parts = 1  # in how many parts a backend takes the samples of an edge pixel; the later ones only where they differ
@@ -69,8 +70,9 @@ class SurfaceRenderer(ABC):
         """Hits of the rays through all pixel centres, row by row."""
 
     @abstractmethod
-    def _samples(self, T: np.ndarray, pixels: np.ndarray, part: int) -> tuple[Hits, int]:
-        """Hits of the K rays of a part of the pattern through each of `pixels` (flat), pixel by pixel, and K."""
+    def _samples(self, T: np.ndarray, pixels: np.ndarray, part: int) -> tuple[np.ndarray, np.ndarray]:
+        """Faces (P, K) uint32 at the K samples of a part of the pattern in each of `pixels` (flat), and where in a
+        pixel (K, 2) they lie."""
 
     def render(self, T_world_camera: np.ndarray, *, step: int = 0, stamp_ns: int = 0) -> Frame:
         """See `Simulator.render`."""
@@ -116,22 +118,43 @@ class SurfaceRenderer(ABC):
             hits.rays, hits.t, hits.face, normal, rgb, self._packed.arrays[2], np.float32(_CONTRAST),
             np.float32(_TEXTURE_CONTRAST), steps, contrast,
         )
-        pixels = np.flatnonzero(contrast)
+        self._blend_edges(T, contrast, rgb)
+        return rgb
+
+    def _blend_edges(self, T: np.ndarray, marked: np.ndarray, rgb: np.ndarray) -> None:
+        """Replace the colours `rgb` (H * W, 3) of the pixels `marked` (H, W) by means over samples."""
+        pixels = np.flatnonzero(marked)
         total, count = np.zeros((len(pixels), 3), np.float32), np.zeros(len(pixels), np.float32)
         centre, doubtful = rgb[pixels], np.arange(len(pixels))
         for part in range(self._parts):
             if len(doubtful) == 0:
                 break
-            samples, k = self._samples(T, pixels[doubtful], part)
-            colours, _ = self._shade(T, samples, 1 / np.sqrt(k), shading.SAMPLE_PROBES)
-            sums, spread = np.empty((len(doubtful), 3), np.float32), np.empty(len(doubtful), np.float32)
-            kernels.sum_samples(colours.reshape(len(doubtful), k, 3), centre[doubtful], sums, spread)
+            seen, offsets = self._samples(T, pixels[doubtful], part)
+            sums, spread = self._sum_faces(T, pixels[doubtful], seen, offsets, centre[doubtful])
             total[doubtful] += sums
-            count[doubtful] += k
+            count[doubtful] += len(offsets)
             doubtful = doubtful[spread > _SPREAD]
         if len(pixels):
             rgb[pixels] = total / count[:, None]
-        return rgb
+
+    def _sum_faces(
+        self, T: np.ndarray, pixels: np.ndarray, seen: np.ndarray, offsets: np.ndarray, centre: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Sum of the colours of the samples of each pixel (P, 3), every face shaded once, and their range (P,)."""
+        camera, count = self._camera, len(pixels)
+        groups, members = np.empty(count, np.int64), np.empty(seen.shape, np.uint32)
+        places = np.empty((*seen.shape, 3), np.float32)
+        kernels_edges.group_samples(seen, offsets, groups, members, places)
+        ends = np.cumsum(groups)
+        rays, face = np.empty((ends[-1], 6), np.float32), np.empty(ends[-1], np.uint32)
+        kernels_edges.group_rays(
+            pixels, ends, groups, members, places, camera.width, np.ascontiguousarray(T), 1 / camera.fx, 1 / camera.fy,
+            camera.cx, camera.cy, rays, face,
+        )
+        colours, _ = self._shade(T, self._on_planes(rays, face), shading.GROUP_FOOTPRINT, shading.GROUP_PROBES)
+        sums, spread = np.empty((count, 3), np.float32), np.empty(count, np.float32)
+        kernels_edges.sum_groups(ends, groups, places, colours, len(offsets), centre, sums, spread)
+        return sums, spread
 
     def _shade(
         self, T: np.ndarray, hits: Hits, footprint: float, probes: int = shading.MAX_PROBES,
@@ -167,3 +190,10 @@ class SurfaceRenderer(ABC):
         out = np.empty(len(hits.face), np.bool_)
         kernels_mesh.holes(hits.face, hits.bary, a[2], self._packed.cutoff, a[3], a[7], a[8], self._packed.alphas, out)
         return out
+
+    def _on_planes(self, rays: np.ndarray, face: np.ndarray) -> Hits:
+        """Hits of rays (N, 6) on the faces (N,) that they are known to meet."""
+        face = np.ascontiguousarray(face)
+        t, bary = np.empty(len(face), np.float32), np.empty((len(face), 2), np.float32)
+        kernels_mesh.plane_hits(rays, face, self._packed.arrays[0], self._packed.arrays[1], t, bary)
+        return Hits(rays, t, face, bary)

@@ -28,7 +28,8 @@ _MAX_CELLS = 400_000
 # Smallest error against 6 x 6 supersampling on three furnished scenes; -1 aliases, 0 blurs (1 to 4 dB either way).
 TEXTURE_BIAS = -0.6
 MAX_PROBES = 8
-SAMPLE_PROBES = 1  # for samples of an edge pixel, which average one another
+# For a face in a pixel at an edge: the part that it covers is some 0.7 px wide, and its neighbours blur it anyway.
+GROUP_FOOTPRINT, GROUP_PROBES = 0.7, 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)

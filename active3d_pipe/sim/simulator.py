@@ -59,6 +59,10 @@ def open_simulator(
 ) -> Simulator:
     """`make_simulator` for a scene that is already loaded."""
     camera = camera_settings.camera()
+    if sensor_settings.backend == "raster":
+        from active3d_pipe.sim.raster_backend import RasterSimulator
+
+        return RasterSimulator(scene, camera, sensor_settings, seed)
     if sensor_settings.backend == "raycast":
         from active3d_pipe.sim.raycast import RaycastSimulator
 
@@ -67,4 +71,4 @@ def open_simulator(
         from active3d_pipe.sim.pyrender_backend import PyrenderSimulator
 
         return PyrenderSimulator(scene, camera, sensor_settings, seed)
-    raise ConfigError(f"sensor.backend is {sensor_settings.backend!r}; expected raycast or pyrender")
+    raise ConfigError(f"sensor.backend is {sensor_settings.backend!r}; expected raster, raycast or pyrender")
