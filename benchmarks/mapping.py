@@ -124,8 +124,8 @@ def tell(name: str, hybrid: HybridMap, views: list, seen: list, seconds: dict[st
     train, _ = quality(hybrid, seen)
     modules = ", ".join(f"{n} {1000 * s / steps:.0f}" for n, s in sorted(seconds.items(), key=lambda x: -x[1]))
     total = 1000 * sum(seconds.values()) / steps
-    cells = (name, f"{held:.2f}", f"{similarity:.3f}", f"{train:.2f}", str(len(hybrid.gaussians)), f"{total:.0f}", modules)
-    print("| " + " | ".join(cells) + " |", flush=True)
+    cells = (f"{held:.2f}", f"{similarity:.3f}", f"{train:.2f}", str(len(hybrid.gaussians)), f"{total:.0f}", modules)
+    print("| " + " | ".join((name, *cells)) + " |", flush=True)
 
 
 if __name__ == "__main__":
