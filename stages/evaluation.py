@@ -8,8 +8,8 @@ from active3d_pipe.pipeline.stage import NodeId, Stage, StageContext
 from stages import shared
 
 if TYPE_CHECKING:
+    from active3d_pipe.evaluation.geometry_metrics import TruthSurface
     from active3d_pipe.evaluation.views import ViewScores
-    from active3d_pipe.structures import TriangleMesh
 
 CURVE_ROUNDS = 16  # rounds whose surfaces are measured for the curves over steps
 
@@ -31,7 +31,7 @@ def _run(context: StageContext) -> None:
 
     from active3d_pipe.evaluation import evaluate as ev
     from active3d_pipe.evaluation.culling import SeenBy
-    from active3d_pipe.evaluation.geometry_metrics import prepare_truth
+    from active3d_pipe.evaluation.geometry_metrics import prepare_truth, thinned_truth
     from active3d_pipe.sim.observable import observable_points
     from active3d_pipe.storage import meshes
     from active3d_pipe.storage.files import write_json
@@ -41,7 +41,7 @@ def _run(context: StageContext) -> None:
     settings = config.evaluation
     simulator = shared.make_simulator(config, config.run.seed)
     frames = [f for k in range(context.last_round + 1) for f in shared.load_frames(context.input("capture", k))]
-    hybrid = shared.load_map(context.input("export"), context.inputs, config)
+    hybrid = shared.load_map(context.input("export"), context.inputs, config, to_train=False)
     mesh = meshes.read_mesh(context.input("export") / "mesh.ply")
 
     context.progress("ground truth")
@@ -69,7 +69,7 @@ def _run(context: StageContext) -> None:
     metrics |= _run_metrics(context, frames)
     _write_examples(context.out / "examples", render, sets, scores, settings.example_views)
 
-    curves = _curves(context, truth_mesh, observable) if settings.curve_points else []
+    curves = _curves(context, thinned_truth(truth, settings.curve_points)) if settings.curve_points else []
     write_json(context.out / "curves.json", curves)
     (context.out / "curves.csv").write_text(ev.rows_to_csv(curves), encoding="utf-8")
     rows = ev.summary_rows(metrics)
@@ -87,15 +87,13 @@ def _run(context: StageContext) -> None:
     context.notes.update({k: metrics[k] for k in headline if metrics.get(k) is not None})
 
 
-def _curves(context: StageContext, truth_mesh: "TriangleMesh", observable: Any) -> list[dict[str, Any]]:
+def _curves(context: StageContext, truth: "TruthSurface") -> list[dict[str, Any]]:
     """Completion and accuracy of the surface of every sampled round."""
     from active3d_pipe.evaluation import evaluate as ev
-    from active3d_pipe.evaluation.geometry_metrics import prepare_truth
     from active3d_pipe.storage import meshes
     from active3d_pipe.storage.files import read_json
 
     settings = context.config.evaluation
-    truth = prepare_truth(truth_mesh, ev.curve_settings(settings), observable, floors=False)
     points = []
     for node, folder in context.inputs.items():
         if node.stage == "uncertainty" and node.round is not None:
@@ -154,7 +152,7 @@ def _write_examples(folder: Path, render: Any, sets: dict, scores: "dict[str, Vi
 
 
 STAGE = Stage(
-    name="evaluation", version=1, config=("evaluation", "scene", "camera", "sensor", "mapping", "run.seed"),
+    name="evaluation", version=2, config=("evaluation", "scene", "camera", "sensor", "mapping", "run.seed"),
     inputs=_inputs, run=_run, loop=False, parameters=_parameters,
     unkeyed=("scene.file",),
 )

@@ -29,7 +29,7 @@ class EvaluationSettings(Settings):
     view_clearance_m: float = Field(0.3, ge=0, description="least distance of a held-out view from any surface, m")
     circle_views: int = Field(60, ge=0, description="views on the inward-looking circle (second protocol); 0 = none")
     circle_radius_m: float = Field(1.0, gt=0, description="radius of that circle, m")
-    train_views: int = Field(40, ge=0, description="captured frames that are scored too, to show the gap; 0 = none")
+    train_views: int = Field(20, ge=0, description="captured frames that are scored too, to show the gap; 0 = none")
     view_scale: float = Field(1.0, gt=0, le=1, description="resolution of the scored views, 1 = the camera's")
     ms_ssim: bool = Field(True, description="compute MS-SSIM beside plain SSIM")
     lpips: str = Field(

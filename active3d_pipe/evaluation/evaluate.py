@@ -82,7 +82,7 @@ def curve_point(
 ) -> dict[str, Any]:
     """One point of the curves over steps: the surface form alone, on `curve_points` samples.
 
-    `truth` is prepared with the settings of `curve_settings` (fewer points, no floors).
+    `truth` is `thinned_truth` to `curve_points`, or prepared with the settings of `curve_settings` (no floors).
     """
     metrics = surface_metrics(reconstruction, truth, curve_settings(settings), forms=("surface",))
     return {"step": step, **metrics}

@@ -98,6 +98,15 @@ def prepare_truth(
     return TruthSurface(mesh, index, points, mask, samples, density[: settings.num_points], found)
 
 
+def thinned_truth(truth: TruthSurface, count: int) -> TruthSurface:
+    """The same truth with its first `count` samples and no point-to-point forms: what a curve needs.
+
+    Samples are independent draws, so that any of them are a uniform sampling too.
+    """
+    observable = None if truth.observable is None else truth.observable[:count]
+    return TruthSurface(truth.mesh, truth.index, truth.points[:count], observable, {}, np.zeros((0, 3), np.float32))
+
+
 def density_count(mesh: TriangleMesh, settings: EvaluationSettings) -> int:
     """Number of points that the fixed density asks for on `mesh`."""
     return int(min(np.ceil(settings.density_per_m2 * mesh.area_m2), MAX_DENSITY_POINTS))

@@ -7,9 +7,9 @@ it is neither an error nor counted as perfect.
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import ndimage
 
 from active3d_pipe.errors import InputError
+from active3d_pipe.evaluation.kernels_ssim import ssim_rows
 
 WINDOW, SIGMA = 11, 1.5  # Wang et al. 2004
 K1, K2 = 0.01, 0.03
@@ -43,31 +43,18 @@ def _gaussian_window() -> np.ndarray:
     return g / g.sum()
 
 
-def _smooth(maps: np.ndarray) -> np.ndarray:
-    """Gaussian-weighted window means of (N, H, W), only where the window lies inside the image."""
-    g, r = _gaussian_window(), WINDOW // 2
-    filtered = ndimage.correlate1d(ndimage.correlate1d(maps, g, axis=1), g, axis=2)
-    return filtered[:, r:-r, r:-r]
-
-
 def _ssim_terms(a: np.ndarray, b: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Masked means of SSIM and of its contrast-structure factor, each (channels,).
 
     Window statistics are taken over the valid pixels of the window alone, so that an invalid pixel does not spoil
     its neighbours; with a full mask this is plain SSIM.
     """
-    a, b = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
-    inside = mask[WINDOW // 2 : -(WINDOW // 2), WINDOW // 2 : -(WINDOW // 2)]
-    full = bool(mask.all())
-    weight = np.ones(inside.shape) if full else np.maximum(_smooth(mask[None].astype(np.float64))[0], 1e-12)
-    m = 1.0 if full else mask.astype(np.float64)
-    mean_a, mean_b, aa, bb, ab = (
-        _smooth(x) / weight for x in (m * a, m * b, m * a * a, m * b * b, m * a * b)
-    )
-    c1, c2 = K1**2, K2**2
-    cs = (2 * (ab - mean_a * mean_b) + c2) / (aa - mean_a**2 + bb - mean_b**2 + c2)
-    ssim_map = (2 * mean_a * mean_b + c1) / (mean_a**2 + mean_b**2 + c1) * cs
-    return ssim_map[:, inside].mean(axis=1), cs[:, inside].mean(axis=1)
+    channels = a.shape[2]
+    sums = np.zeros((len(mask), 2 * channels + 1))
+    a, b = (np.ascontiguousarray(np.moveaxis(x, -1, 0)) for x in (a, b))
+    ssim_rows(a, b, mask.astype(np.float64), _gaussian_window(), K1**2, K2**2, sums)
+    means = sums.sum(axis=0)
+    return means[:channels] / means[-1], means[channels:-1] / means[-1]
 
 
 def _has_window(mask: np.ndarray) -> bool:
@@ -80,10 +67,7 @@ def ssim(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -
 
     None when no valid pixel has its window inside the image. Source: Wang et al., Image quality assessment, 2004.
     """
-    image, truth, mask = check_pair(image, truth, mask)
-    if not _has_window(mask):
-        return None
-    return float(_ssim_terms(image, truth, mask)[0].mean())
+    return ssim_pair(image, truth, mask, with_ms_ssim=False)[0]
 
 
 def ms_ssim(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float | None:
@@ -92,19 +76,28 @@ def ms_ssim(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None
     None for images under 161 px on a side, whose coarsest octave has no window. Negative factors count as zero.
     Source: Wang et al., Multiscale structural similarity, 2003.
     """
+    return ssim_pair(image, truth, mask)[1]
+
+
+def ssim_pair(
+    image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None, *, with_ms_ssim: bool = True
+) -> tuple[float | None, float | None]:
+    """`ssim` and `ms_ssim` of one pair; they share the finest octave, which is most of the work."""
     a, b, mask = check_pair(image, truth, mask)
-    if min(mask.shape) <= (WINDOW - 1) * 2 ** (len(MS_SSIM_WEIGHTS) - 1):
-        return None
-    product = np.ones(a.shape[2])
-    for level, exponent in enumerate(MS_SSIM_WEIGHTS):
+    if not _has_window(mask):
+        return None, None
+    whole, cs = _ssim_terms(a, b, mask)
+    plain = float(whole.mean())
+    if not with_ms_ssim or min(mask.shape) <= (WINDOW - 1) * 2 ** (len(MS_SSIM_WEIGHTS) - 1):
+        return plain, None
+    product = np.maximum(cs, 0) ** MS_SSIM_WEIGHTS[0]
+    for level, exponent in enumerate(MS_SSIM_WEIGHTS[1:], start=1):
+        a, b, mask = _halve([a, b], mask)
         if not _has_window(mask):
-            return None
+            return plain, None
         whole, cs = _ssim_terms(a, b, mask)
-        last = level == len(MS_SSIM_WEIGHTS) - 1
-        product *= np.maximum(whole if last else cs, 0) ** exponent
-        if not last:
-            a, b, mask = _halve([a, b], mask)
-    return float(product.mean())
+        product *= np.maximum(whole if level == len(MS_SSIM_WEIGHTS) - 1 else cs, 0) ** exponent
+    return plain, float(product.mean())
 
 
 def _halve(images: Sequence[np.ndarray], mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

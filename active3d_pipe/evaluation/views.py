@@ -53,10 +53,11 @@ def score_view(
     """All view metrics of one render; only pixels with a true depth count."""
     rgb, depth, alpha = (np.asarray(x) for x in render)
     truth, mask = frame.rgb.astype(np.float64) / 255, frame.depth > 0
+    plain, multi_scale = image_metrics.ssim_pair(rgb, truth, mask, with_ms_ssim=with_ms_ssim)
     return {
         "psnr": image_metrics.psnr(rgb, truth, mask),
-        "ssim": image_metrics.ssim(rgb, truth, mask),
-        "ms_ssim": image_metrics.ms_ssim(rgb, truth, mask) if with_ms_ssim else None,
+        "ssim": plain,
+        "ms_ssim": multi_scale,
         "lpips": lpips(rgb, truth, mask) if lpips else None,
         **image_metrics.depth_errors_cm(depth, frame.depth),
         "rendered_share": float((alpha > 0.5)[mask].mean()) if mask.any() else None,

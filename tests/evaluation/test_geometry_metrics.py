@@ -6,7 +6,13 @@ import trimesh
 
 from active3d_pipe.errors import InputError, NumericalError
 from active3d_pipe.evaluation.config import EvaluationSettings
-from active3d_pipe.evaluation.geometry_metrics import mad_cm, prepare_truth, sample_surface, surface_metrics
+from active3d_pipe.evaluation.geometry_metrics import (
+    mad_cm,
+    prepare_truth,
+    sample_surface,
+    surface_metrics,
+    thinned_truth,
+)
 from active3d_pipe.structures import TriangleMesh
 
 SETTINGS = EvaluationSettings(num_points=20_000, density_per_m2=2500)
@@ -98,6 +104,16 @@ def test_unobservable_truth_is_left_out_of_the_observable_figures():
     assert m["completion_cm_surface_observable"] == pytest.approx(0, abs=1e-4)
     assert m["completion_ratio_surface"] < 0.6
     assert "precision_surface_observable" not in m
+
+
+def test_thinned_truth_says_the_same_with_fewer_points():
+    truth = prepare_truth(rectangle(4, 1), SETTINGS, lambda p: p[:, 0] < 2)
+    fewer = thinned_truth(truth, 5000)
+    assert len(fewer.points) == len(fewer.observable) == 5000
+    m = surface_metrics(rectangle(1, 1), fewer, SETTINGS)
+    assert m["completion_ratio_surface"] == pytest.approx(0.25 + 0.05 / 4, abs=0.02)
+    assert m["completion_ratio_surface_observable"] == pytest.approx(0.5 + 0.05 / 2, abs=0.03)
+    assert not any("p2p" in name for name in m)
 
 
 def test_empty_reconstruction_has_no_distances_and_completes_nothing():

@@ -110,3 +110,12 @@ def test_shapes_must_agree():
         im.psnr(np.zeros((4, 4, 3)), np.zeros((4, 4, 3)), np.ones((3, 3), bool))
     with pytest.raises(InputError, match="depth"):
         im.depth_errors_cm(np.zeros((4, 4)), np.zeros((4, 5)))
+
+
+def test_the_pair_of_both_measures_is_the_two_of_them():
+    rng = np.random.default_rng(5)
+    a = rng.random((180, 170, 3))
+    b, mask = np.clip(a + rng.normal(0, 0.1, a.shape), 0, 1), rng.random((180, 170)) < 0.8
+    assert im.ssim_pair(a, b, mask) == (im.ssim(a, b, mask), im.ms_ssim(a, b, mask))
+    assert im.ssim_pair(a, b, mask, with_ms_ssim=False) == (im.ssim(a, b, mask), None)
+    assert im.ssim_pair(a, b, np.zeros_like(mask)) == (None, None)
