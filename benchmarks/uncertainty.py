@@ -21,7 +21,7 @@ import numpy as np
 
 from active3d_pipe.mapping.hybrid_map import HybridMap
 from active3d_pipe.mapping.update import update_map
-from active3d_pipe.pipeline.config import Config, load_run_config, with_values
+from active3d_pipe.pipeline.config import Config, load_config, load_run_config, with_values
 from active3d_pipe.storage.files import read_json
 from active3d_pipe.structures import Frame
 from active3d_pipe.uncertainty.carving import integrate_depth
@@ -58,9 +58,10 @@ def judge(
 
 def replay(run: Path, given: argparse.Namespace) -> list[dict]:
     """Judgements of rounds 0.. of one run; each is a dict by set of voxels."""
-    config = load_run_config(run / "run.toml", Config)
-    stride = max(1, config.uncertainty.ray_stride // given.scale)
-    changed = {"ray_stride": stride, "render_stride": max(1, config.uncertainty.render_stride // given.scale)}
+    # The run says what was mapped; the uncertainty judged is that of the present defaults, plus --set.
+    present = load_config(None, given.settings).uncertainty
+    config = load_run_config(run / "run.toml", Config).model_copy(update={"uncertainty": present})
+    changed = {name: max(1, getattr(present, name) // given.scale) for name in ("ray_stride", "render_stride")}
     config = with_values(config, uncertainty=changed)
     settings = config.uncertainty
     folders = sorted(p for p in (run / "capture").iterdir() if (p / shared.LOG_NAME).exists())[: given.rounds]
@@ -152,6 +153,7 @@ def main() -> None:
     parser.add_argument("--scale", type=int, default=2, help="resolution is divided by this")
     parser.add_argument("--rounds", type=int, default=12, help="rounds of each run that are replayed")
     parser.add_argument("--horizon", type=int, default=3, help="rounds ahead whose frames reveal the error")
+    parser.add_argument("--set", action="append", default=[], dest="settings", help="uncertainty.name=value")
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     by_run = {}
