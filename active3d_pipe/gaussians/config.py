@@ -8,7 +8,7 @@ from active3d_pipe.structures import Settings
 class GaussianSettings(Settings):
     """Gaussian model: rendering, losses, optimisation, seeding, pruning."""
 
-    max_count: int = Field(default=400_000, ge=1, description="most primitives the model may hold")
+    max_count: int = Field(default=1_000_000, ge=1, description="most primitives the model may hold")
 
     # Rendering
     dilation_px2: float = Field(

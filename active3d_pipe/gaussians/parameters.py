@@ -117,29 +117,42 @@ class GaussianParameters:
         self.moment2 = torch.cat([others.moment2, self.moment2])
         self.steps = torch.cat([others.steps, self.steps])
 
+    def forget(self) -> None:
+        """Set moments and step counts to zero, as if the optimiser had never run."""
+        self.moment1, self.moment2 = torch.zeros_like(self.values), torch.zeros_like(self.values)
+        self.steps = torch.zeros(len(self), dtype=torch.int32)
+
     def state(self) -> dict[str, np.ndarray]:
-        """Everything a later `from_state` needs to go on with the same bytes; views, valid until the next step."""
+        """Everything a later `from_state` needs to go on with the same bytes; views, valid until the next step.
+
+        `moment1`, `moment2` and `steps` hold the last primitives only, from the first one with a step on: those
+        before it have zeros.
+        """
+        moved = np.flatnonzero(self.steps.numpy())
+        first = int(moved[0]) if len(moved) else len(self)
         return {
             "values": self.values.detach().numpy(),
-            "moment1": self.moment1.numpy(),
-            "moment2": self.moment2.numpy(),
-            "steps": self.steps.numpy(),
+            "moment1": self.moment1.numpy()[first:],
+            "moment2": self.moment2.numpy()[first:],
+            "steps": self.steps.numpy()[first:],
         }
 
     @classmethod
     def from_state(cls, state: dict[str, np.ndarray]) -> "GaussianParameters":
         """Inverse of `state`; raises ArtifactError on missing, misshapen or mistyped arrays."""
-        arrays = []
         n = len(state["values"]) if "values" in state else 0
-        shapes = {"values": (n, WIDTH), "moment1": (n, WIDTH), "moment2": (n, WIDTH), "steps": (n,)}
-        for name, shape in shapes.items():
+        m = len(state["steps"]) if "steps" in state else 0
+        whole = {}
+        for name in ("values", "moment1", "moment2", "steps"):
             a = state.get(name)
+            shape = (n if name == "values" else m, WIDTH) if name != "steps" else (m,)
             dtype = np.int32 if name == "steps" else np.float32
-            if a is None or a.shape != shape or a.dtype != dtype:
+            if a is None or a.shape != shape or a.dtype != dtype or m > n:
                 got = "missing" if a is None else f"{a.shape} {a.dtype}"
                 raise ArtifactError(f"optimiser state: {name} is {got}, expected {shape} {np.dtype(dtype)}")
-            arrays.append(torch.from_numpy(a.copy()))
-        return cls(*arrays)
+            whole[name] = np.zeros((n, *shape[1:]), dtype)
+            whole[name][n - len(a) :] = a
+        return cls(*(torch.from_numpy(a) for a in whole.values()))
 
     def step(
         self,

@@ -42,7 +42,7 @@ def unit_rgb(frame: Frame) -> np.ndarray:
 def seed(hybrid: HybridMap, frame: Frame, rng: np.random.Generator, clock: Clock) -> int:
     """Insert primitives where the frame shows surface that the map does not render; returns their number."""
     settings = hybrid.settings.gaussians
-    room = settings.max_count - hybrid.num_gaussians
+    room = int(settings.max_count * hybrid.settings.seeding_share) - hybrid.num_gaussians
     if room <= 0:
         return 0
     with clock.of("seeding"):
@@ -98,11 +98,11 @@ def coupling_gradient(hybrid: HybridMap, rng: np.random.Generator, clock: Clock)
 
 
 def add_where_wrong(
-    hybrid: HybridMap, frame: Frame, most: int, rng: np.random.Generator, clock: Clock
+    hybrid: HybridMap, frame: Frame, most: int, limit: int, rng: np.random.Generator, clock: Clock
 ) -> int:
-    """Error-driven adding on one frame; returns the number of new primitives."""
+    """Error-driven adding of at most `most` primitives on one frame, up to `limit` in all; returns their number."""
     settings = hybrid.settings.gaussians
-    most = min(most, settings.max_count - hybrid.num_gaussians)
+    most = min(most, limit - hybrid.num_gaussians)
     if most <= 0:
         return 0
     with clock.of("adding"):

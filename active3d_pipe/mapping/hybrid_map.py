@@ -42,7 +42,8 @@ class HybridMap:
     def working_set(self, frames: Sequence[Frame]) -> Iterator[None]:
         """Inside, `gaussians` holds only what `frames` see, so that an iteration costs what is near, not the scene.
 
-        Views of other frames are incomplete meanwhile. Primitives that rest keep their optimiser state.
+        Views of other frames are incomplete meanwhile. Primitives that rest stay as they are, and forget their
+        optimiser state: what a checkpoint holds of it is what the last working set needs.
         """
         settings, values = self.settings.gaussians, self.gaussians.values.numpy()
         raster = RasterPass(
@@ -53,6 +54,7 @@ class HybridMap:
         for frame in frames:
             seen |= raster.project(values, frame.camera, frame.T_world_camera)
         self._resting = self.gaussians.split(seen)
+        self._resting.forget()
         try:
             yield
         finally:

@@ -35,8 +35,8 @@ def refine(
         if i % 20 == 0:
             progress(f"refining field {i}/{settings.refinement_field_iterations}")
     total, added, pruned = settings.refinement_iterations, 0, 0
-    room = max(settings.gaussians.max_count - len(hybrid.gaussians), 0)
-    quota = max(1, int(room / max(total * ADD_UNTIL / ADD_EVERY, 1)))
+    limit = min(settings.gaussians.max_count, int(len(hybrid.gaussians) * (1 + settings.refinement_growth)))
+    quota = max(1, int((limit - len(hybrid.gaussians)) / max(total * ADD_UNTIL / ADD_EVERY, 1)))
     coupled = settings.representation == "hybrid"
     order: list[int] = []
     scores: list[float] = []
@@ -45,7 +45,7 @@ def refine(
             order = [int(j) for j in rng.permutation(len(frames))]
         frame = frames[order.pop()]
         if i % ADD_EVERY == 0 and i < total * ADD_UNTIL:
-            added += branches.add_where_wrong(hybrid, frame, quota, rng, clock)
+            added += branches.add_where_wrong(hybrid, frame, quota, limit, rng, clock)
         pull = None
         if coupled and i % settings.coupling_every == settings.coupling_every - 1:
             pull = branches.coupling_gradient(hybrid, rng, clock)

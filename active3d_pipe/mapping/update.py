@@ -103,6 +103,7 @@ def _gaussians(
     """Train the explicit branch over the window; returns (mean PSNR of the last pass, added, pruned)."""
     settings = hybrid.settings
     coupled = settings.representation == "hybrid"
+    limit = int(settings.gaussians.max_count * settings.adding_share)
     scores: list[float] = []
     added = pruned = 0
     # Adding looks once at every new keyframe and at some of the others, in the first two thirds of the iterations, so
@@ -112,7 +113,7 @@ def _gaussians(
     for i in range(iterations):
         if i in adding:
             frame = hybrid.keyframes[adding[i]].frame
-            added += branches.add_where_wrong(hybrid, frame, settings.add_per_round // len(looked_at), rng, clock)
+            added += branches.add_where_wrong(hybrid, frame, settings.add_per_round // len(looked_at), limit, rng, clock)
         index = draw_keyframe(rng, window, older, settings.window.replay)
         pull = None
         if coupled and i % settings.coupling_every == settings.coupling_every - 1:

@@ -107,9 +107,25 @@ def test_resume_gives_the_same_bytes() -> None:
         assert a.tobytes() == resumed.state()[name].tobytes()
 
 
+def test_state_holds_moments_of_what_moved_only() -> None:
+    moved = GaussianParameters.from_model(wall(20))
+    moved.step(np.ones((20, 14), np.float32), GaussianSettings())
+    resting = moved.split(np.arange(20) >= 8)
+    resting.forget()
+    moved.join(resting)
+    moved.append(wall(3, 2))
+    state = moved.state()
+    assert [len(state[n]) for n in ("values", "moment1", "moment2", "steps")] == [23, 15, 15, 15]
+    back = GaussianParameters.from_state(state)
+    for name in ("values", "moment1", "moment2", "steps"):
+        assert torch.equal(getattr(back, name), getattr(moved, name))
+
+
 @pytest.mark.parametrize("damage", ["missing", "shape", "dtype"])
 def test_damaged_state_is_refused(damage: str) -> None:
-    state = GaussianParameters.from_model(wall(5)).state()
+    params = GaussianParameters.from_model(wall(5))
+    params.step(np.ones((5, 14), np.float32), GaussianSettings())
+    state = params.state()
     if damage == "missing":
         del state["moment2"]
     elif damage == "shape":

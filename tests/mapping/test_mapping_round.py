@@ -75,7 +75,7 @@ def test_window_holds_the_newest_and_their_neighbours_and_replay_the_others() ->
     assert draw_older(np.random.default_rng(0), range(len(known)), len(known), settings) == []
 
 
-def test_working_set_changes_neither_number_nor_state_of_the_rest() -> None:
+def test_working_set_changes_neither_number_nor_values() -> None:
     hybrid = grown()
     before = {row.tobytes() for row in hybrid.gaussians.values.numpy()}
     frame = hybrid.keyframes[0].frame
