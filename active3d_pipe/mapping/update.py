@@ -110,10 +110,11 @@ def _gaussians(
     # that what is new still settles.
     looked_at = window[-(num_new + OTHERS_LOOKED_AT) :]
     adding = {int(i * iterations * 0.66 / max(len(looked_at), 1)): index for i, index in enumerate(looked_at)}
+    quota = settings.add_per_round // max(len(looked_at), 1)
     for i in range(iterations):
         if i in adding:
             frame = hybrid.keyframes[adding[i]].frame
-            added += branches.add_where_wrong(hybrid, frame, settings.add_per_round // len(looked_at), limit, rng, clock)
+            added += branches.add_where_wrong(hybrid, frame, quota, limit, rng, clock)
         index = draw_keyframe(rng, window, older, settings.window.replay)
         pull = None
         if coupled and i % settings.coupling_every == settings.coupling_every - 1:
