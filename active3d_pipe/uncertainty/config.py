@@ -46,9 +46,9 @@ class UncertaintySettings(Settings):
     sigma_floor_m: float = Field(0.01, gt=0, description="least field sigma believed for occupancy, m")
 
     # Explicit term
-    top_k_views: int = Field(3, ge=0, description="size of C_high: most uncertain keyframes that are rendered again")
-    render_every: int = Field(3, ge=1, description="every n-th new frame is rendered with the map of its round")
-    predict_every: int = Field(4, ge=1, description="every n-th new frame is predicted by the map of the round before")
+    top_k_views: int = Field(2, ge=0, description="size of C_high: most uncertain keyframes that are rendered again")
+    render_every: int = Field(4, ge=1, description="every n-th new frame is rendered with the map of its round")
+    predict_every: int = Field(5, ge=1, description="every n-th new frame is predicted by the map of the round before")
     render_stride: int = Field(4, ge=1, description="those renderings have this fraction of the camera's resolution")
     residual_blur_voxels: float = Field(
         0.7, ge=0, description="standard deviation of the neighbourhood over which residuals are averaged, voxels"

@@ -109,12 +109,14 @@ def most_uncertain(
     The volume of the last round decides, so that only the chosen views have to be rendered.
     """
     means = []
-    flat = u_exp.ravel()
+    flat, thinned = u_exp.ravel(), (slice(CHOICE_STRIDE // 2, None, CHOICE_STRIDE),) * 2
+    rays: dict[Camera, np.ndarray] = {}
     for frame in frames:
-        thinned = (slice(CHOICE_STRIDE // 2, None, CHOICE_STRIDE),) * 2
-        depth, rays = frame.depth[thinned], projection.pixel_rays(frame.camera)[thinned]
-        points = se3.transform_points(frame.T_world_camera, (rays * depth[..., None])[depth > 0].astype(np.float64))
-        ijk = grid.index_of(points)
+        if frame.camera not in rays:
+            rays[frame.camera] = projection.pixel_rays(frame.camera)[thinned]
+        depth = frame.depth[thinned]
+        points = (rays[frame.camera] * depth[..., None])[depth > 0]
+        ijk = grid.index_of(se3.transform_points(frame.T_world_camera, points.astype(np.float64)))
         ijk = ijk[grid.contains_index(ijk)]
         voxels = np.ravel_multi_index(tuple(ijk.T), grid.shape)
         means.append(float(flat[voxels].mean(dtype=np.float64)) if len(voxels) else 0.0)
