@@ -1,14 +1,21 @@
 """The knobs of next-best-view search, path planning and the stop rule."""
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from active3d_pipe.information.config import InformationSettings
+from active3d_pipe.planning.policies.registry import check_name
 from active3d_pipe.structures.settings import Settings
 
 
 class PlanningSettings(Settings):
     """Section `planning` of the configuration."""
 
+    policy: str = Field(
+        "active3d", description="who decides where to look: a policy of docs/policies.md, or your own as module:Class"
+    )
+    trajectory: str = Field(
+        "", description="policy trajectory: file of poses (JSON, NPY, TXT) or run folder whose poses are walked again"
+    )
     information: InformationSettings = Field(
         InformationSettings(), description="weights and observation model of the expected gain"
     )
@@ -62,3 +69,8 @@ class PlanningSettings(Settings):
     # Start.
     bootstrap_turn_deg: float = Field(360.0, ge=0, le=720, description="turn on the spot before anything is known")
     bootstrap_pitch_deg: float = Field(25.0, ge=0, le=60, description="nodding of that turn, up and down, degrees")
+
+    @field_validator("policy")
+    @classmethod
+    def _known(cls, value: str) -> str:
+        return check_name(value)
