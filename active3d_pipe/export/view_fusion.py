@@ -14,6 +14,7 @@ QueryColor = QuerySdf
 READING_STRIDE = 4  # of the pixels, every how many mark their cell; the lines between them close the gaps
 JOIN = 0.1  # neighbouring readings belong to one surface when they differ by less than this share of the depth
 MIN_COSINE = 0.15  # colours are taken from views that see the surface at this cosine or better
+COLOUR_FOOTPRINT = 0.5  # of a vertex's spacing: what its colour is a mean over
 MAX_COLOUR_FRAMES = 150  # evenly spread; neighbouring frames of a walk see nearly the same
 COLOUR_NOISE = 12.0  # difference, of 255, from which on a view counts as an outlier (occluder, highlight)
 
@@ -91,7 +92,7 @@ def colour_from_views(
             kernels.add_colours(
                 spheres, vertices, normals, *_pose(frame), frame.depth, frame.rgb, np.float32(frame.camera.near),
                 np.float32(frame.depth.max()), np.float32(settings.colour_tolerance_m), np.float32(MIN_COSINE),
-                np.float32(settings.voxel_size_m), mean, np.float32(inv_variance), sums,
+                np.float32(COLOUR_FOOTPRINT * settings.voxel_size_m), mean, np.float32(inv_variance), sums,
             )
         mean = sums[:, :3] / np.maximum(sums[:, 3:], np.float32(1e-12))
     colors = np.rint(np.clip(mean, 0, 255)).astype(np.uint8)
