@@ -9,6 +9,7 @@ import typer
 
 from active3d_pipe import __version__
 from active3d_pipe.cli import console, session
+from active3d_pipe.cli.compare import compare
 from active3d_pipe.cli.configure import app as configure
 from active3d_pipe.cli.doctor import doctor
 from active3d_pipe.cli.explore import evaluate, export, report, resume, run, run_stage
@@ -38,7 +39,9 @@ def _options(
     session.debug, session.quiet = debug, quiet
 
 
-for command in (run, resume, run_stage, status, inspect, fork, export, evaluate, report, verify, gc, view, doctor):
+for command in (
+    run, resume, run_stage, status, inspect, fork, export, evaluate, report, verify, gc, view, doctor, compare,
+):
     app.command(command.__name__.replace("_", "-"))(command)
 app.add_typer(scene, name="scene")
 app.add_typer(configure, name="config")

@@ -4,6 +4,7 @@ import hashlib
 import io
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +26,7 @@ def read_poses(path: Path) -> np.ndarray:
     try:
         if path.is_dir():
             files = _captures(path)
-            poses = [T for file in files for T in json.loads(file.read_text())["poses"]]
+            poses: Any = [T for file in files for T in json.loads(file.read_text())["poses"]]
         elif path.suffix == ".npy":
             poses = np.load(io.BytesIO(path.read_bytes()), allow_pickle=False)
         elif path.suffix == ".json":

@@ -44,7 +44,7 @@ def confidence(view: MapView) -> np.ndarray:
     direction, weight, count = np.zeros((len(means), 3)), np.zeros(len(means)), np.zeros(len(means))
     chosen = spread_poses(view.keyframe_poses, KEYFRAMES) if frames else np.zeros(0, np.int64)
     for i in chosen:
-        frame = frames[i]
+        frame = frames[int(i)]
         uv, z = projection.project(means, frame.T_world_camera, frame.camera)
         seen = np.flatnonzero(projection.in_image(uv, z, frame.camera))
         ij = np.floor(uv[seen]).astype(int)

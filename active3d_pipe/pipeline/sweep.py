@@ -1,0 +1,212 @@
+"""A sweep: variants x scenes x seeds, one ordinary run folder each, one after the other. Knows no 3D.
+
+    OUT/sweep.json                        what was asked for, and how every run ended
+    OUT/<scene>/<variant>/seed_<n>/       a run folder as `active3d run` makes it
+
+Interrupted, it goes on where it stopped: what is done with the same settings is skipped, what was begun is taken up
+by its own run. A run that fails is marked and does not stop the others; the next call tries it again.
+"""
+
+import json
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from active3d_pipe.errors import ConfigError
+from active3d_pipe.pipeline import files
+from active3d_pipe.pipeline.keys import digest
+from active3d_pipe.pipeline.layers import read_toml
+
+SWEEP = "sweep.json"
+KEYS = ("title", "base", "steps", "seeds", "scenes", "variants", "set", "metrics")
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """One column of the comparison: settings as `a.b=value` texts on top of the base."""
+
+    name: str
+    label: str
+    settings: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Spec:
+    """What is compared. `base` is a preset or file, `settings` hold for every run, `metrics` names table rows."""
+
+    title: str
+    base: str
+    scenes: tuple[str, ...]
+    seeds: tuple[int, ...]
+    variants: tuple[Variant, ...]
+    settings: tuple[str, ...] = ()
+    metrics: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One run of a sweep: the names of its folders and all of its settings."""
+
+    scene: str
+    variant: str
+    seed: int
+    base: str
+    settings: tuple[str, ...]
+
+    def folder(self, out: Path) -> Path:
+        """Its run folder."""
+        return out / self.scene / self.variant / f"seed_{self.seed}"
+
+    @property
+    def key(self) -> str:
+        """Digest of everything that was asked for."""
+        return digest(asdict(self))
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """How a run ended: `done`, or `failed` with one line."""
+
+    state: str
+    key: str
+    error: str = ""
+
+
+def scene_name(scene: str) -> str:
+    """A folder name for a scene: that of its folder when the file is just called scene or mesh."""
+    path = Path(scene)
+    generic = path.stem in ("scene", "mesh") and path.suffix and path.parent.name
+    is_file = path.suffix in (".glb", ".gltf", ".obj", ".ply")
+    plain = path.parent.name if generic else path.stem if is_file else scene
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", plain).strip("_") or "scene"
+
+
+def flat_settings(table: Mapping[str, Any], prefix: str = "") -> tuple[str, ...]:
+    """A nested table of settings as `a.b=value` texts, values in TOML."""
+    out: list[str] = []
+    for name, value in table.items():
+        if isinstance(value, Mapping):
+            out += flat_settings(value, f"{prefix}{name}.")
+        else:
+            out.append(f"{prefix}{name}={json.dumps(value, ensure_ascii=False)}")
+    return tuple(out)
+
+
+def read_spec(path: Path, variant_of: Callable[[str], Mapping[str, Any]]) -> Spec:
+    """Read a TOML file of a comparison; `variant_of` gives the settings that the name of a variant stands for.
+
+    A variant is a name, or a table with `name` and, if wanted, `label` and `set` (a list of `a.b=value` texts).
+
+    Raises:
+        ConfigError: an unknown key, a missing one, or two variants of one name; one line.
+    """
+    doc = read_toml(path)
+    unknown = sorted(set(doc) - set(KEYS))
+    if unknown:
+        raise ConfigError(f"{path}: {unknown[0]!r} is not known here; expected {', '.join(KEYS)}")
+    for key in ("scenes", "variants"):
+        if not isinstance(doc.get(key), list) or not doc[key]:
+            raise ConfigError(f"{path}: `{key}` is missing; expected a list")
+    variants = tuple(make_variant(entry, variant_of, str(path)) for entry in doc["variants"])
+    settings = list(doc.get("set", []))
+    if "steps" in doc:
+        settings.insert(0, f"run.steps={int(doc['steps'])}")
+    return checked(
+        Spec(
+            str(doc.get("title", path.stem)), str(doc.get("base", "default")), tuple(str(s) for s in doc["scenes"]),
+            tuple(int(s) for s in doc.get("seeds", [0])), variants, tuple(settings), tuple(doc.get("metrics", ())),
+        )
+    )
+
+
+def make_variant(entry: Any, variant_of: Callable[[str], Mapping[str, Any]], where: str) -> Variant:
+    """A variant from a name or a table."""
+    table = {"name": entry} if isinstance(entry, str) else dict(entry)
+    if not isinstance(table.get("name"), str) or set(table) - {"name", "label", "set"}:
+        raise ConfigError(f"{where}: variant {entry!r}; expected a name, or a table with name, label, set")
+    texts = flat_settings(variant_of(table["name"]))
+    name = re.sub(r"[^A-Za-z0-9._-]+", "_", Path(table["name"]).stem)
+    return Variant(name, str(table.get("label", name)), (*texts, *table.get("set", ())))
+
+
+def checked(spec: Spec) -> Spec:
+    """The spec itself; ConfigError when two runs would share a folder."""
+    for what, names in (("variant", [v.name for v in spec.variants]), ("scene", [scene_name(s) for s in spec.scenes])):
+        twice = sorted({n for n in names if names.count(n) > 1})
+        if twice:
+            raise ConfigError(f"{what} {twice[0]!r} is given twice; every {what} needs a name of its own")
+    return spec
+
+
+def cells(spec: Spec) -> list[Cell]:
+    """Every run, seed by seed, so that a sweep that is stopped early has whole columns."""
+    return [
+        Cell(
+            scene_name(scene), variant.name, seed, spec.base,
+            (*spec.settings, *variant.settings, f"scene.file={json.dumps(scene)}", f"run.seed={seed}"),
+        )
+        for seed in spec.seeds for scene in spec.scenes for variant in spec.variants
+    ]
+
+
+class Sweep:
+    """A sweep and its state on disk."""
+
+    def __init__(self, out: Path, spec: Spec) -> None:
+        self.out = out
+        self.spec = spec
+        self.cells = cells(spec)
+        self.ended = {name: Ended(**e) for name, e in self._read().get("ended", {}).items()}
+
+    def state(self, cell: Cell) -> Ended | None:
+        """How the run ended, or None when it did not yet (or was asked for with other settings)."""
+        ended = self.ended.get(self._name(cell))
+        return ended if ended is not None and ended.key == cell.key else None
+
+    def run(
+        self, execute: Callable[[Cell, Path], str], say: Callable[[str], None], is_complete: Callable[[Path], bool]
+    ) -> int:
+        """Run what is not done; returns how many failed.
+
+        Args:
+            execute: makes one run; returns "" or one line that says why it failed. It may raise to stop the sweep.
+            say: called with one line before and after every run.
+            is_complete: whether a run folder holds what the tables are made of.
+        """
+        self._write()
+        failed = 0
+        for n, cell in enumerate(self.cells, 1):
+            place = f"[{n}/{len(self.cells)}] {cell.scene} {cell.variant} seed {cell.seed}"
+            before = self.state(cell)
+            if before is not None and before.state == "done" and is_complete(cell.folder(self.out)):
+                say(f"{place}: done before")
+                continue
+            say(f"{place} ...")
+            error = execute(cell, cell.folder(self.out))
+            self.ended[self._name(cell)] = Ended("failed" if error else "done", cell.key, error)
+            failed += bool(error)
+            self._write()
+            say(f"{place}: {'FAILED: ' + error if error else 'done'}")
+        return failed
+
+    def _name(self, cell: Cell) -> str:
+        return f"{cell.scene}/{cell.variant}/seed_{cell.seed}"
+
+    def _read(self) -> dict[str, Any]:
+        path = self.out / SWEEP
+        try:
+            return dict(json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else {}
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"{path}: cannot be read ({error}); remove it, finished runs are found again") from error
+
+    def _write(self) -> None:
+        document = {
+            "schema": "active3d.sweep/1", "spec": asdict(self.spec),
+            "ended": {name: asdict(e) for name, e in sorted(self.ended.items())},
+        }
+        with files.writing(self.out):
+            files.make_folder(self.out)
+            files.replace_file(self.out / SWEEP, (json.dumps(document, indent=1) + "\n").encode())
+

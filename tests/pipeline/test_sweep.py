@@ -1,0 +1,111 @@
+import pytest
+
+from active3d_pipe.errors import ConfigError
+from active3d_pipe.pipeline import sweep as s
+from active3d_pipe.pipeline.layers import read_layers
+
+TEXT = """
+title = "T"
+base = "smoke"
+steps = 5
+seeds = [0, 1]
+scenes = ["x/room/scene.glb", "generated:rooms=1,seed=5"]
+variants = ["a", { name = "b", label = "B!", set = ["run.max_rounds=3"] }]
+set = ["run.threads=1"]
+"""
+
+
+def settings_of(name):
+    return {"a": {}, "b": {"uncertainty": {"terms": ["imp", "exp"], "lambda_imp": 0.0}}}[name]
+
+
+@pytest.fixture
+def spec(tmp_path):
+    file = tmp_path / "t.toml"
+    file.write_text(TEXT)
+    return s.read_spec(file, settings_of)
+
+
+def test_every_combination_is_one_run_with_a_folder_of_its_own(spec, tmp_path):
+    cells = s.cells(spec)
+    assert len(cells) == 8
+    assert len({c.folder(tmp_path) for c in cells}) == 8
+    assert cells[1].folder(tmp_path) == tmp_path / "room" / "b" / "seed_0"
+    assert cells[2].scene == "generated_rooms_1_seed_5"
+    assert [c.seed for c in cells] == [0] * 4 + [1] * 4
+
+
+def test_settings_are_what_the_command_line_takes(spec):
+    cell = s.cells(spec)[1]
+    values = read_layers(cell.base, cell.settings, {}).values
+    assert values["uncertainty"] == {"terms": ["imp", "exp"], "lambda_imp": 0.0}
+    assert values["run"]["steps"] == 5 and values["run"]["threads"] == 1 and values["run"]["max_rounds"] == 3
+    assert values["scene"]["file"] == "x/room/scene.glb" and values["run"]["seed"] == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ('title = "T"\ncolour = 3', "'colour' is not known"),
+        ('scenes = []', "`scenes` is missing"),
+        ('variants = ["a", "a"]', "given twice"),
+        ('variants = [{ label = "x" }]', "expected a name"),
+    ],
+)
+def test_mistakes_are_one_line(tmp_path, change, said):
+    key = change.split(" = ")[0]
+    lines = [line for line in TEXT.splitlines() if not line.startswith(f"{key} =")]
+    file = tmp_path / "t.toml"
+    file.write_text("\n".join([*lines, change]))
+    with pytest.raises(ConfigError, match=said) as error:
+        s.read_spec(file, settings_of)
+    assert "\n" not in str(error.value)
+
+
+def drive(spec, out, fails=(), stop_at=None):
+    ran, said = [], []
+
+    def execute(cell, folder):
+        if stop_at is not None and len(ran) == stop_at:
+            raise KeyboardInterrupt
+        ran.append(folder.relative_to(out).as_posix())
+        folder.mkdir(parents=True, exist_ok=True)
+        if ran[-1] in fails:
+            return "it broke"
+        (folder / "done").touch()
+        return ""
+
+    sweep = s.Sweep(out, spec)
+    failed = sweep.run(execute, said.append, lambda folder: (folder / "done").exists())
+    return ran, said, failed, sweep
+
+
+def test_finished_runs_are_skipped_and_failed_ones_do_not_stop_the_others(spec, tmp_path):
+    bad = "room/b/seed_0"
+    ran, said, failed, sweep = drive(spec, tmp_path, fails=(bad,))
+    assert len(ran) == 8 and failed == 1
+    assert any("FAILED: it broke" in line for line in said)
+    assert sweep.state(sweep.cells[1]).state == "failed"
+    # Called again only the failed one is tried; now it works.
+    ran, said, failed, sweep = drive(spec, tmp_path)
+    assert ran == [bad] and failed == 0
+    assert sum("done before" in line for line in said) == 7
+    assert all(sweep.state(c).state == "done" for c in sweep.cells)
+
+
+def test_an_interrupted_sweep_goes_on(spec, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        drive(spec, tmp_path, stop_at=3)
+    ran, *_ = drive(spec, tmp_path)
+    assert len(ran) == 5
+
+
+def test_other_settings_or_a_lost_folder_run_again(spec, tmp_path):
+    from dataclasses import replace
+
+    drive(spec, tmp_path)
+    ran, *_ = drive(replace(spec, settings=("run.steps=6",)), tmp_path)
+    assert len(ran) == 8
+    (tmp_path / "room/a/seed_0/done").unlink()
+    ran, *_ = drive(replace(spec, settings=("run.steps=6",)), tmp_path)
+    assert ran == ["room/a/seed_0"]
