@@ -13,6 +13,39 @@ CHUNK = 1024  # faces or vertices that share a bounding sphere
 SPLIT_MAX = 8  # marks between two neighbouring readings of one surface
 
 
+@njit(cache=True)
+def _cross(vertices, a, b, c, out):
+    """(b - a) x (c - a) of three vertices."""
+    for d in range(3):
+        e, g = (d + 1) % 3, (d + 2) % 3
+        out[d] = (vertices[b, e] - vertices[a, e]) * (vertices[c, g] - vertices[a, g]) - (
+            vertices[b, g] - vertices[a, g]) * (vertices[c, e] - vertices[a, e])
+
+
+@njit(parallel=True, cache=True)
+def face_centres(vertices, faces, centroids, normals):
+    """Centroids and unit normals (F, 3) float32 of faces (F, 3) over vertices (V, 3) float32; zero without area."""
+    for f in prange(faces.shape[0]):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        for d in range(3):
+            centroids[f, d] = (vertices[a, d] + vertices[b, d] + vertices[c, d]) * np.float32(1 / 3)
+        _cross(vertices, a, b, c, normals[f])
+        length = np.sqrt(normals[f, 0] ** 2 + normals[f, 1] ** 2 + normals[f, 2] ** 2)
+        for d in range(3):
+            normals[f, d] /= max(length, np.float32(1e-30))
+
+
+@njit(cache=True)
+def sum_normals(vertices, faces, sums):
+    """Add every face's normal, as long as twice its area, to sums (V, 3) float32 of its vertices."""
+    normal = np.empty(3, np.float32)
+    for f in range(faces.shape[0]):
+        _cross(vertices, faces[f, 0], faces[f, 1], faces[f, 2], normal)
+        for m in range(3):
+            for d in range(3):
+                sums[faces[f, m], d] += normal[d]
+
+
 @njit(parallel=True, cache=True)
 def bounding_spheres(points, spheres):
     """spheres (C, 4) float32: centre of the bounding box and radius of each chunk of points (N, 3) float32."""

@@ -7,7 +7,7 @@ from scipy.ndimage import binary_dilation
 
 from active3d_pipe.export import kernels_views as kernels
 from active3d_pipe.export.config import MeshSettings
-from active3d_pipe.export.isosurface import QuerySdf, face_normals, keep_faces
+from active3d_pipe.export.isosurface import QuerySdf, keep_faces
 from active3d_pipe.structures import Frame, TriangleMesh, VoxelGrid
 
 QueryColor = QuerySdf
@@ -15,7 +15,7 @@ READING_STRIDE = 4  # of the pixels, every how many mark their cell; the lines b
 JOIN = 0.1  # neighbouring readings belong to one surface when they differ by less than this share of the depth
 MIN_COSINE = 0.15  # colours are taken from views that see the surface at this cosine or better
 COLOUR_FOOTPRINT = 0.5  # of a vertex's spacing: what its colour is a mean over
-MAX_COLOUR_FRAMES = 150  # evenly spread; neighbouring frames of a walk see nearly the same
+MAX_COLOUR_FRAMES = 100  # evenly spread; neighbouring frames of a walk see nearly the same
 COLOUR_NOISE = 12.0  # difference, of 255, from which on a view counts as an outlier (occluder, highlight)
 
 
@@ -52,8 +52,8 @@ def cull_unseen(mesh: TriangleMesh, frames: Sequence[Frame], settings: MeshSetti
     """
     if len(mesh.faces) == 0:
         return mesh
-    centroids = _centroids(mesh)
-    normals = _unit(face_normals(mesh))
+    centroids, normals = np.empty(mesh.faces.shape, np.float32), np.empty(mesh.faces.shape, np.float32)
+    kernels.face_centres(mesh.vertices, mesh.faces, centroids, normals)
     seen = np.zeros(len(mesh.faces), bool)
     spheres = _spheres(centroids)
     for frame in frames:
@@ -105,21 +105,9 @@ def colour_from_views(
 
 def vertex_normals(mesh: TriangleMesh) -> np.ndarray:
     """(V, 3) float32 unit normals, means over the faces weighted by area; zero for a vertex without faces."""
-    normals = face_normals(mesh)
-    total = np.stack([
-        sum(np.bincount(mesh.faces[:, c], weights=normals[:, d], minlength=len(mesh.vertices)) for c in range(3))
-        for d in range(3)
-    ], axis=1)
-    return _unit(total)
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return (vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30)).astype(np.float32)
-
-
-def _centroids(mesh: TriangleMesh) -> np.ndarray:
-    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
-    return (a + b + c) * np.float32(1 / 3)
+    sums = np.zeros(mesh.vertices.shape, np.float32)
+    kernels.sum_normals(mesh.vertices, mesh.faces, sums)
+    return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.float32(1e-30))
 
 
 def _spheres(points: np.ndarray) -> np.ndarray:
