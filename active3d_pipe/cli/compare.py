@@ -16,18 +16,21 @@ if TYPE_CHECKING:
     from active3d_pipe.pipeline.sweep import Cell, Spec, Sweep
 
 FOLDERS = ("ablations", "baselines")
-_LIST = {"show_default": False}
 
 
 def compare(
     what: list[str] = typer.Argument(
-        ..., help="A comparison (TOML), or variants: policies, ablations, configuration files.", **_LIST
+        ..., help="A comparison (TOML), or variants: policies, ablations, configuration files.", show_default=False
     ),
-    scene: list[str] = typer.Option([], "--scene", help="A scene; may be given again.", **_LIST),
-    seed: list[int] = typer.Option([], "--seed", help="A seed; may be given again. [default: 0]", **_LIST),
-    steps: int = typer.Option(None, "--steps", help="Steps of every run.", **_LIST),
-    base: str = typer.Option(None, "--base", help="Preset or file under every variant. [default: default]", **_LIST),
-    out: Path = typer.Option(None, "--out", help="Folder of the comparison. [default: runs/NAME]", **_LIST),
+    scene: list[str] = typer.Option([], "--scene", help="A scene; may be given again.", show_default=False),
+    seed: list[int] = typer.Option(
+        [], "--seed", help="A seed; may be given again. [default: 0]", show_default=False
+    ),
+    steps: int = typer.Option(None, "--steps", help="Steps of every run.", show_default=False),
+    base: str = typer.Option(
+        None, "--base", help="Preset or file under every variant. [default: default]", show_default=False
+    ),
+    out: Path = typer.Option(None, "--out", help="Folder of the comparison. [default: runs/NAME]", show_default=False),
     set_: list[str] = session.SET,
     tables_only: bool = typer.Option(False, "--tables-only", help="Make the tables of what is there; run nothing."),
     dry_run: bool = typer.Option(False, "--dry-run", help="Say what would run; do nothing."),

@@ -35,6 +35,8 @@ def read_poses(path: Path) -> np.ndarray:
         else:
             poses = np.loadtxt(io.BytesIO(path.read_bytes()), ndmin=2).reshape(-1, 4, 4)
         out = np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4)
+    except InputError:
+        raise
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}; expected {EXPECTED}") from error
     except (KeyError, TypeError, ValueError) as error:

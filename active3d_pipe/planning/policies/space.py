@@ -59,14 +59,15 @@ def in_view(context: PolicyContext, poses: np.ndarray, wanted: np.ndarray, coars
 def line_of_sight(context: PolicyContext, start_world: np.ndarray, ends_world: np.ndarray) -> np.ndarray:
     """(N,) bool, whether the way from one point to each of `ends_world` (N, 3) meets no solid voxel."""
     d = np.asarray(ends_world, dtype=np.float64) - start_world
-    length = np.linalg.norm(d, axis=1)
-    grid, blocked = context.volume.grid, solid(context)
-    free = np.ones(len(d), bool)
-    for s in np.linspace(0, 1, 31)[1:-1]:
-        ijk = grid.index_of(start_world + s * d)
-        inside = grid.contains_index(ijk) & ((1 - s) * length > 1.5 * grid.voxel_size)
-        free[inside] &= ~blocked[tuple(ijk[inside].T)]
-    return free
+    length = np.maximum(np.linalg.norm(d, axis=1), 1e-9)
+    grid = context.volume.grid
+    origin = ((np.asarray(start_world) - grid.origin) / grid.voxel_size).astype(np.float32)
+    rays = np.ascontiguousarray(d / length[:, None] / grid.voxel_size, dtype=np.float32)
+    met = np.zeros(len(d), np.float32)
+    opaque = solid(context).view(np.uint8).ravel()
+    kernels_traversal.first_hits(opaque, origin, rays, np.float32(length.max(initial=0)), grid.shape, met)
+    # The end itself may lie on a surface.
+    return (met <= 0) | (met > length - 1.5 * grid.voxel_size)
 
 
 def spread_positions(context: PolicyContext, space: FreeSpace, spacing_m: float, most: int) -> np.ndarray:
