@@ -10,13 +10,17 @@ from scipy.stats import wilcoxon
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """A row of the tables: key in `metrics.json`, name as the paper prints it, factor, digits, which way is better."""
+    """A row of the tables: key in `metrics.json`, name as the paper prints it, factor, digits, which way is better.
+
+    `judged` is False for what is neither good nor bad by itself: nothing is marked as best.
+    """
 
     key: str
     name: str
     factor: float
     digits: int
     higher: bool
+    judged: bool = True
 
 
 # The rows of the paper's tables. Completion is judged against surface that some reachable pose can see.
@@ -31,8 +35,8 @@ METRICS = (
 )
 EXTRA = (
     Metric("completion_ratio_surface", "C.R. whole (%)", 100, 2, True),
-    Metric("steps", "steps", 1, 0, False),
-    Metric("path_m", "path (m)", 1, 1, False),
+    Metric("steps", "steps", 1, 0, False, judged=False),
+    Metric("path_m", "path (m)", 1, 1, False, judged=False),
     Metric("collisions", "collisions", 1, 0, False),
     Metric("seconds_per_step", "s/step", 1, 2, False),
 )
@@ -106,7 +110,7 @@ def average(results: Sequence[Result], metric: Metric) -> Summary:
 def best(summaries: Sequence[Summary], metric: Metric) -> set[int]:
     """Indices of the best cells as they are printed (ties share); none when fewer than two have a value."""
     shown = {i: round(s.mean, metric.digits) for i, s in enumerate(summaries) if s.mean is not None}
-    if len(shown) < 2:
+    if len(shown) < 2 or not metric.judged:
         return set()
     top = max(shown.values()) if metric.higher else min(shown.values())
     return {i for i, value in shown.items() if value == top}

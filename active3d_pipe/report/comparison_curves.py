@@ -57,7 +57,7 @@ def _panel(axes: Axes, results: Sequence[Result], labels: Mapping[str, str], col
         axes.plot(x, mean, color=color, linestyle=style, label=label)
         if len(curves) > 1:
             axes.fill_between(x, low, high, color=color, alpha=0.15, linewidth=0)
-    axes.set_ylim(top=100.5)
+    axes.set_ylim(top=min(axes.get_ylim()[1], 100.5))
 
 
 def write_figure(results: Sequence[Result], labels: Mapping[str, str], folder: Path) -> list[Path]:

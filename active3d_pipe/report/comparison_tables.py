@@ -61,8 +61,8 @@ class Grid:
 
 
 def arrow(metric: Metric) -> str:
-    """↑ or ↓."""
-    return "↑" if metric.higher else "↓"
+    """↑, ↓ or nothing."""
+    return "" if not metric.judged else "↑" if metric.higher else "↓"
 
 
 def per_scene_markdown(grid: Grid) -> str:
@@ -75,14 +75,14 @@ def per_scene_markdown(grid: Grid) -> str:
             for c, s in enumerate(grid.row(variant, metric)):
                 text = cell_text(s, metric)
                 cells.append(f"**{text}**" if variant in winners[metric.key][c] else text)
-            lines.append([grid.labels[variant] if n == 0 else "", f"{metric.name} {arrow(metric)}", *cells])
+            lines.append([grid.labels[variant] if n == 0 else "", f"{metric.name} {arrow(metric)}".strip(), *cells])
     return _markdown(lines)
 
 
 def overall_markdown(grid: Grid) -> str:
     """The layout of the paper's ablation table: one line for every method, means over scenes."""
     metrics = _ablation(grid.metrics)
-    lines = [["Method", *(f"{m.name} {arrow(m)}" for m in metrics)], ["---"] * (1 + len(metrics))]
+    lines = [["Method", *(f"{m.name} {arrow(m)}".strip() for m in metrics)], ["---"] * (1 + len(metrics))]
     winners = {m.key: grid.best_of(m)[-1] for m in metrics}
     for variant in grid.variants:
         texts = [cell_text(grid.row(variant, m)[-1], m) for m in metrics]
@@ -196,6 +196,8 @@ def _shade(text: str, is_best: bool) -> str:
 
 
 def _latex_arrow(metric: Metric) -> str:
+    if not metric.judged:
+        return ""
     return r"$\uparrow$" if metric.higher else r"$\downarrow$"
 
 

@@ -162,13 +162,16 @@ def test_unknown_policies_are_named_in_one_line():
 def test_only_policies_that_look_at_the_map_have_it_as_an_input():
     from types import SimpleNamespace
 
-    from stages.planning import STAGE
+    from active3d_pipe.pipeline.graph import Registry
+    from active3d_pipe.pipeline.stage import NodeId
+    from stages.registry import FINISH, LOOP
 
-    def extra(policy):
-        return STAGE.extra_inputs(SimpleNamespace(planning=PlanningSettings(policy=policy)), 3)
+    def inputs(policy):
+        config = SimpleNamespace(planning=PlanningSettings(policy=policy))
+        return {str(n) for n in Registry(LOOP, FINISH).inputs(NodeId("planning", 3), 3, config)}
 
-    assert extra("active3d") == () and extra("naruto") == ()
-    assert [str(n) for n in extra("fisherrf")] == ["mapping/round_0003"]
+    assert inputs("naruto") == inputs("active3d")
+    assert inputs("fisherrf") - inputs("active3d") == {"mapping/round_0003"}
 
 
 def test_the_map_must_be_asked_for():
@@ -187,3 +190,26 @@ def test_an_unfinished_goal_is_gone_on_to():
     assert second.terms["committed"]
     goals = [d.ranking[d.chosen].T_world_camera for d in (first, second)]
     np.testing.assert_allclose(goals[0][:3, 3], goals[1][:3, 3])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(POLICIES))
+def test_every_policy_explores_a_real_room(name, tmp_path):
+    """The whole loop on a generated room, each policy in a run folder of its own; nothing is touched."""
+    import json
+
+    from tests.tiny_run import active3d
+
+    recorded = tmp_path / "poses.json"
+    start = se3.pose_from_yaw_pitch(np.array([1.0, 1.0, 1.2]), 0.0, 0.0)
+    recorded.write_text(json.dumps([start.tolist()]))
+    run = tmp_path / name
+    settings = ["--set", f"planning.policy={name}"]
+    if name == "trajectory":
+        settings += ["--set", f"planning.trajectory={recorded}"]
+    done = active3d("run", "smoke", "--out", run, "--set", "run.steps=40", *settings)
+    assert done.returncode == 0, done.stderr
+    metrics = json.loads((run / "evaluation" / "metrics.json").read_text())["metrics"]
+    assert metrics["collisions"] == 0 and metrics["steps"] >= 16
+    decisions = sorted((run / "planning").glob("round_*/decision.json"))
+    assert all(json.loads(d.read_text())["reason"] for d in decisions)

@@ -9,6 +9,7 @@ from active3d_pipe.report import comparison as c
 from active3d_pipe.report import comparison_tables as tables
 from active3d_pipe.report.comparison_curves import band, write_figure
 from active3d_pipe.report.comparison_data import read_result
+from tests.tiny_run import active3d
 
 LABELS = {"ours": "Ours", "other": "Other & co", "none": "None"}
 PSNR, ACC = c.KNOWN["psnr"], c.KNOWN["accuracy_cm_surface"]
@@ -134,9 +135,8 @@ def test_figures_are_written_and_equal_bytes(results, tmp_path):
     assert write_figure([result("a", "ours", 0, state="missing")], LABELS, tmp_path) == []
 
 
-def test_reading_a_run_folder(tmp_path):
-    run = tmp_path / "run"
-    assert read_result("a", "v", 0, run).state == "missing"
+def fabricate(run):
+    """The files of a finished run that tables are made of."""
     (run / "evaluation").mkdir(parents=True)
     (run / "evaluation" / "metrics.json").write_text(json.dumps({"metrics": {"psnr": 30.0, "steps": 20, "x": None}}))
     key = "completion_ratio_surface_observable"
@@ -149,7 +149,49 @@ def test_reading_a_run_folder(tmp_path):
     events = [("capture/round_0000", 1.0), ("capture/round_0000", 3.0), ("mapping/round_0000", 5.0), ("export", 9.0)]
     lines = [json.dumps({"event": "commit", "node": n, "seconds": s}) for n, s in events]
     (run / "journal.jsonl").write_text("\n".join(lines))
+
+
+def test_reading_a_run_folder(tmp_path):
+    run = tmp_path / "run"
+    assert read_result("a", "v", 0, run).state == "missing"
+    fabricate(run)
     r = read_result("a", "v", 0, run)
     assert r.metrics == {"psnr": 30.0, "steps": 20.0, "seconds_per_step": 8 / 20}
     np.testing.assert_allclose(r.curve, [(10, 0.5, 0.5), (20, 3.5, 0.75)])
     assert read_result("a", "v", 0, run, "broke").state == "failed"
+
+
+def test_what_is_neither_good_nor_bad_is_not_marked(results):
+    for r in results:
+        if r.metrics:
+            r.metrics["steps"] = 10.0 + r.seed
+    grid = tables.Grid(results, LABELS, [c.KNOWN["steps"]])
+    text = tables.overall_markdown(grid)
+    assert "**" not in text and text.startswith("| Method | steps |")
+
+
+def test_the_command_makes_tables_of_what_is_there_and_says_what_is_left(tmp_path):
+    out = tmp_path / "out"
+    fabricate(out / "room" / "active3d" / "seed_0")
+    scene = tmp_path / "room" / "scene.glb"
+    common = ("compare", "active3d", "without_rgb_uncertainty", "--scene", scene, "--out", out)
+    plan = active3d(*common, "--dry-run", "--steps", 7)
+    assert plan.returncode == 0, plan.stderr
+    assert "2 of 2 would run" in plan.stdout and "--set run.steps=7" in plan.stdout
+    made = active3d(*common, "--tables-only", "--json")
+    assert made.returncode == 0, made.stderr
+    document = json.loads(made.stdout)
+    assert document["runs"]["room/without_rgb_uncertainty/seed_0"] == "to do"
+    names = {f.rsplit("/", 1)[1] for f in document["files"]}
+    assert {"overall.md", "per_scene.tex", "tests.md", "completion.png"} <= names
+    assert "| active3d | 30.00 |" in (out / "overall.md").read_text()
+    wrong = active3d("compare", "narutoo", "--scene", "x", "--out", out)
+    assert wrong.returncode == 2 and "did you mean 'naruto'" in wrong.stderr and wrong.stderr.count("\n") == 1
+
+
+def test_a_run_that_fails_is_marked_and_the_command_says_so(tmp_path):
+    scene = tmp_path / "nowhere.glb"
+    done = active3d("compare", "random", "--base", "smoke", "--scene", scene, "--out", tmp_path / "out")
+    assert done.returncode == 1
+    assert "FAILED" in done.stderr and "no such file" in done.stderr
+    assert "×" in (tmp_path / "out" / "overall.md").read_text()
