@@ -44,7 +44,7 @@ class SensorSettings(Settings):
     """How the scene is rendered and what the depth sensor does to the true depth."""
 
     backend: Literal["raster", "raycast", "pyrender"] = Field(
-        "raycast", description="renderer: raster (scan conversion, fastest), raycast (Open3D) or pyrender (EGL)"
+        "raster", description="renderer: raster (scan conversion, fastest), raycast (Open3D) or pyrender (EGL)"
     )
     edge_samples: int = Field(
         14, ge=0, le=64, description="colour samples of a pixel that holds an edge; 0 = no supersampling"
