@@ -2,6 +2,7 @@
 
 import errno
 import json
+import resource
 import shutil
 import time
 from collections.abc import Iterable
@@ -182,6 +183,7 @@ class Executor:
         self.journal.append(
             event, node=str(node), key=record.key, content=record.content, bytes=record.size,
             seconds=round(seconds, 4), timings={name: round(float(s), 4) for name, s in context.timings.items()},
+            peak_memory_mb=round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
         )
 
     def _readable_record(self, node: NodeId) -> Record | None:
