@@ -117,16 +117,18 @@ def walked_poses(inputs: Mapping[NodeId, Path], last_round: int) -> np.ndarray:
     return np.concatenate([np.array(read_json(folder / CAPTURE_NAME)["poses"]) for folder in folders])
 
 
-def save_map(folder: Path, hybrid: "HybridMap") -> None:
-    """Write a map: parameters, optimiser state, keyframe list."""
+def save_map(folder: Path, hybrid: "HybridMap", *, to_train: bool = True) -> None:
+    """Write a map: parameters, keyframe list, and what is needed `to_train` it further."""
     from active3d_pipe.storage.files import write_json, write_tensors
 
     state = hybrid.state()
     write_tensors(folder / "field.safetensors", state["field"])
     write_tensors(folder / "gaussians.safetensors", state["gaussians"])
-    write_tensors(folder / "optimiser.safetensors", state["optimiser"])
     write_json(folder / "keyframes.json", [k.to_json() for k in hybrid.keyframes])
-    _newest_map[:] = [(_identity(folder), hybrid)]
+    _newest_map.clear()
+    if to_train:
+        write_tensors(folder / "optimiser.safetensors", state["optimiser"])
+        _newest_map.append((_identity(folder), hybrid))
 
 
 def _identity(folder: Path) -> tuple:
