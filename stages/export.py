@@ -14,6 +14,7 @@ def _run(context: StageContext) -> None:
     import time
 
     from active3d_pipe.export.final_mesh import final_mesh
+    from active3d_pipe.export.viewer_model import fit_to_viewers
     from active3d_pipe.mapping.refine import refine
     from active3d_pipe.storage import meshes, splats
     from active3d_pipe.storage.files import write_json
@@ -30,15 +31,20 @@ def _run(context: StageContext) -> None:
     mesh = final_mesh(hybrid.field, frames, config.export.mesh)
     context.timings["mesh"] = time.perf_counter() - start
 
+    start = time.perf_counter()
+    exact, order = hybrid.gaussians.to_model(), context.rng("viewers")
+    viewers = fit_to_viewers(exact, frames, config.mapping.gaussians, config.export, order, context.progress)
+    context.timings["Gaussians for viewers"] = time.perf_counter() - start
+
     shared.save_map(context.out, hybrid)
     meshes.write_mesh_ply(context.out / "mesh.ply", mesh)
     if config.export.glb:
         meshes.write_mesh_glb(context.out / "mesh.glb", mesh)
-    splats.write_splats(context.out / "gaussians.ply", hybrid.gaussians.to_model())
+    splats.write_splats(context.out / "gaussians.ply", viewers, "fitted to viewers; the map is gaussians.safetensors")
     numbers = {**report.numbers, "vertices": len(mesh.vertices), "faces": len(mesh.faces)}
     numbers["mesh_area_m2"] = round(mesh.area_m2, 3)
     write_json(context.out / "export.json", {"schema": "active3d.export/1", **numbers})
     context.notes.update(numbers)
 
 
-STAGE = Stage(name="export", version=2, config=("mapping", "export"), inputs=_inputs, run=_run, loop=False)
+STAGE = Stage(name="export", version=3, config=("mapping", "export"), inputs=_inputs, run=_run, loop=False)

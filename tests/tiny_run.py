@@ -42,6 +42,9 @@ rays = 256
 plane_resolutions_m = [0.32, 0.12]
 color_plane_resolutions_m = [0.32, 0.12]
 
+[export]
+viewer_iterations = 40
+
 [export.mesh]
 voxel_size_m = 0.05
 

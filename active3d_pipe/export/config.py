@@ -46,6 +46,13 @@ class ExportSettings(Settings):
 
     mesh: MeshSettings = Field(default_factory=MeshSettings, description="the coloured mesh")
     glb: bool = Field(True, description="write the mesh as GLB beside PLY")
+    viewer_iterations: int = Field(
+        600, ge=0, description="iterations that fit a copy of the Gaussians (gaussians.ply) to the filters of other "
+        "programs; 0 = a plain copy of the map's"
+    )
+    viewer_learning_rate_scale: float = Field(
+        0.3, gt=0, description="scale on the Gaussians' learning rates in that fit"
+    )
     preview_voxel_m: float = Field(
         0.08, gt=0, description="cell edge of the coarse surface written every round (curves, looking at progress), m"
     )

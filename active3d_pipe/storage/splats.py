@@ -1,4 +1,8 @@
-"""Gaussians as the INRIA `.ply` that splat viewers read (degree-0 colour)."""
+"""Gaussians as the INRIA `.ply` that splat viewers read (degree-0 colour).
+
+The format says nothing of the screen-space filter that the numbers were made for, so what a viewer shows depends on
+its own: `export.viewer_model` makes the copy that suits them.
+"""
 
 from pathlib import Path
 
