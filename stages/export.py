@@ -36,7 +36,7 @@ def _run(context: StageContext) -> None:
     viewers = fit_to_viewers(exact, frames, config.mapping.gaussians, config.export, order, context.progress)
     context.timings["Gaussians for viewers"] = time.perf_counter() - start
 
-    shared.save_map(context.out, hybrid)
+    shared.save_map(context.out, hybrid, to_train=False)
     meshes.write_mesh_ply(context.out / "mesh.ply", mesh)
     if config.export.glb:
         meshes.write_mesh_glb(context.out / "mesh.glb", mesh)

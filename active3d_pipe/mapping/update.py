@@ -15,7 +15,7 @@ from active3d_pipe.mapping.window import choose_window, draw_keyframe, draw_olde
 from active3d_pipe.structures import Frame, UncertaintyVolume
 
 PRUNE_EVERY = 100  # iterations
-OTHERS_LOOKED_AT = 3  # keyframes of the window, beside the new ones, that error-driven adding looks at in a round
+OTHERS_LOOKED_AT = 1  # keyframes of the window, beside the new ones, that error-driven adding looks at in a round
 
 
 @dataclass(frozen=True, slots=True)
