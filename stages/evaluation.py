@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from active3d_pipe.evaluation.geometry_metrics import TruthSurface
     from active3d_pipe.evaluation.views import ViewScores
 
+MAX_FRAMES = 1000  # logged frames that say what was seen, evenly spread: bounds the memory of long runs
 CURVE_ROUNDS = 16  # rounds whose surfaces are measured for the curves over steps
 
 
@@ -40,7 +41,7 @@ def _run(context: StageContext) -> None:
     config = context.config
     settings = config.evaluation
     simulator = shared.make_simulator(config, config.run.seed)
-    frames = [f for k in range(context.last_round + 1) for f in shared.load_frames(context.input("capture", k))]
+    frames = shared.load_spread(context.inputs, context.last_round, MAX_FRAMES)
     hybrid = shared.load_map(context.input("export"), context.inputs, config, to_train=False)
     mesh = meshes.read_mesh(context.input("export") / "mesh.ply")
 
@@ -66,7 +67,7 @@ def _run(context: StageContext) -> None:
         render, sets, settings, lambda name, done, total: context.progress(f"{name} views {done}/{total}")
     )
     metrics |= ev.view_metrics(scores)
-    metrics |= _run_metrics(context, frames)
+    metrics |= _run_metrics(context)
     _write_examples(context.out / "examples", render, sets, scores, settings.example_views)
 
     curves = _curves(context, thinned_truth(truth, settings.curve_points)) if settings.curve_points else []
@@ -120,12 +121,10 @@ def _view_sets(simulator: Any, frames: list, settings: Any) -> dict[str, list]:
     }
 
 
-def _run_metrics(context: StageContext, frames: list) -> dict[str, Any]:
-    from active3d_pipe.storage.files import read_json
-
-    logs = [read_json(context.input("capture", k) / shared.CAPTURE_NAME) for k in range(context.last_round + 1)]
+def _run_metrics(context: StageContext) -> dict[str, Any]:
+    logs = [shared.read_capture(context.input("capture", k)) for k in range(context.last_round + 1)]
     return {
-        "steps": len(frames), "rounds": context.last_round + 1,
+        "steps": sum(len(d["poses"]) for d in logs), "rounds": context.last_round + 1,
         "collisions": sum(d["collisions"] for d in logs),
         "path_m": round(sum(d["path_length_m"] for d in logs), 3),
         "min_clearance_m": min(d["min_clearance_m"] for d in logs),

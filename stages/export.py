@@ -21,8 +21,7 @@ def _run(context: StageContext) -> None:
 
     config, last = context.config, context.last_round
     hybrid = shared.load_map(context.input("mapping", last), context.inputs, config)
-    frames = [f for k in range(last + 1) for f in shared.load_frames(context.input("capture", k))]
-    frames = shared.spread(frames, MAX_FRAMES)
+    frames = shared.load_spread(context.inputs, last, MAX_FRAMES)
     report = refine(hybrid, frames, context.rng("refinement"), context.progress)
     context.timings.update(report.seconds)
 

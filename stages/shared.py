@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 LOG_NAME, CAPTURE_NAME, DECISION_NAME = "frames.mcap", "capture.json", "decision.json"
 VOLUME_NAME, SURFACE_NAME = "volume.zarr", "surface.ply"
-CACHE_BYTES = 1 << 30  # decoded frames kept in memory between the stages of one process
+CACHE_BYTES = 1 << 29  # decoded frames kept in memory between the stages of one process
 
 _frames: "OrderedDict[tuple, list[Frame]]" = OrderedDict()
 _simulators: "dict[str, Simulator]" = {}
@@ -46,11 +46,29 @@ def load_frames(folder: Path) -> "list[Frame]":
     return frames
 
 
-def load_rig(inputs: Mapping[NodeId, Path]) -> dict[str, Any]:
-    """What the first capture says of the scene box and the start pose: all that later stages may know of the world."""
+def load_spread(inputs: Mapping[NodeId, Path], last_round: int, most: int) -> "list[Frame]":
+    """At most `most` of the frames of rounds 0..last_round, evenly spread: a long run need not fit into memory."""
+    folders = [inputs[node] for node in captures(last_round)]
+    steps = [len(read_capture(folder)["poses"]) for folder in folders]
+    chosen = set(spread(range(sum(steps)), most))
+    first = np.cumsum([0, *steps])
+    found = []
+    for folder, start, stop in zip(folders, first, first[1:], strict=False):
+        if not chosen.isdisjoint(range(start, stop)):
+            found += [f for i, f in enumerate(load_frames(folder), start=start) if i in chosen]
+    return found
+
+
+def read_capture(folder: Path) -> dict[str, Any]:
+    """What a capture artifact says of itself: poses, steps so far, collisions, the rig."""
     from active3d_pipe.storage.files import read_json
 
-    return read_json(inputs[NodeId("capture", 0)] / CAPTURE_NAME)["rig"]
+    return read_json(folder / CAPTURE_NAME)
+
+
+def load_rig(inputs: Mapping[NodeId, Path]) -> dict[str, Any]:
+    """What the first capture says of the scene box and the start pose: all that later stages may know of the world."""
+    return read_capture(inputs[NodeId("capture", 0)])["rig"]
 
 
 def make_simulator(config: Any, seed: int) -> "Simulator":
@@ -111,10 +129,7 @@ def spread(items: "Sequence[T]", most: int) -> "list[T]":
 
 def walked_poses(inputs: Mapping[NodeId, Path], last_round: int) -> np.ndarray:
     """(M, 4, 4) poses of every captured frame, in order."""
-    from active3d_pipe.storage.files import read_json
-
-    folders = [inputs[node] for node in captures(last_round)]
-    return np.concatenate([np.array(read_json(folder / CAPTURE_NAME)["poses"]) for folder in folders])
+    return np.concatenate([np.array(read_capture(inputs[node])["poses"]) for node in captures(last_round)])
 
 
 def save_map(folder: Path, hybrid: "HybridMap", *, to_train: bool = True) -> None:

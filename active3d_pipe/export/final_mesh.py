@@ -1,6 +1,6 @@
 """The mesh that a run hands over: extracted near what was read, culled by what was seen, coloured from the views."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -16,8 +16,12 @@ class Surface(Protocol):
 
     low: np.ndarray
     high: np.ndarray
-    query_sdf: Callable[[np.ndarray], np.ndarray]
-    query_color: Callable[[np.ndarray], np.ndarray]
+
+    def query_sdf(self, points: np.ndarray) -> np.ndarray:
+        """(N,) SDF, m, at world points (N, 3)."""
+
+    def query_color(self, points: np.ndarray) -> np.ndarray:
+        """(N, 3) colour in 0..1 at world points (N, 3)."""
 
 
 def final_mesh(field: Surface, frames: Sequence[Frame], settings: MeshSettings) -> TriangleMesh:
