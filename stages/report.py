@@ -201,19 +201,23 @@ def _fusion(documents: list[dict[str, Any]]) -> "rd.FusionHistory":
 
 
 def _decision_rows(context: StageContext, decisions: "list[Decision]") -> "list[rd.DecisionRow]":
-    """What each decision expected, beside the entropy drop that the next round brought."""
+    """What each decision expected of its path, beside the entropy drop that the next round brought."""
     from active3d_pipe.report.data import DecisionRow
 
     entropy = [n["entropy_bits"] for n in _records(context, "uncertainty")]
     rows = []
     for k, decision in enumerate(decisions):
-        best = decision.ranking[decision.chosen] if decision.chosen >= 0 else None
+        best, terms = decision.ranking[decision.chosen] if decision.chosen >= 0 else None, decision.terms
+        outcome = decisions[k + 1].terms.get("previous", {}) if k + 1 < len(decisions) else {}
         realised = entropy[k] - entropy[k + 1] if k + 1 < len(entropy) else None
+        if outcome:
+            realised = outcome["realised_imp"] + outcome["realised_exp"]
         rows.append(
             DecisionRow(
-                k, decision.reason.value, best.gain_imp if best else None, best.gain_exp if best else None, realised,
-                decision.terms.get("path_length_m"), decision.terms.get("max_risk"), len(decision.path),
-                decision.terms.get("num_candidates"),
+                k, decision.reason.value, terms.get("predicted_imp", best.gain_imp if best else None),
+                terms.get("predicted_exp", best.gain_exp if best else None), realised,
+                terms.get("path_length_m"), terms.get("max_risk"), len(decision.path), terms.get("num_candidates"),
+                outcome.get("realised_imp"), outcome.get("realised_exp"),
             )
         )
     return rows

@@ -11,6 +11,7 @@ from active3d_pipe.planning.candidates import Directions, coarse_positions, fine
 from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.free_space import FreeSpace
 from active3d_pipe.planning.reward import RewardField, exact_terms, sphere_rewards
+from active3d_pipe.planning.targets import target_positions
 from active3d_pipe.structures.camera import Camera
 from active3d_pipe.structures.decision import Decision, ScoredCandidate
 from active3d_pipe.structures.motion import MotionSettings
@@ -90,14 +91,16 @@ def score(
     directions = view_directions(camera, settings.num_yaws, settings.pitches_deg)
     num_views = len(directions.rotations)
 
+    # Turning is the same from every position, so it is measured once a view.
+    turning = view_cost_steps(np.zeros(num_views), R, directions.rotations, motion)
+
     def utilities(voxels: np.ndarray, rewards: np.ndarray) -> np.ndarray:
-        travel = np.repeat(space.cost[tuple(voxels.T)], num_views)
-        rotations = np.tile(directions.rotations, (len(voxels), 1, 1))
-        steps = view_cost_steps(travel, R, rotations, motion).reshape(rewards.shape)
-        return utility_rate(rewards, steps, settings)
+        walking = space.cost[tuple(voxels.T)] / np.float32(motion.max_step_m)
+        return utility_rate(rewards, np.maximum(walking[:, None], turning[None]), settings)
 
     # The place where the agent stands is always a candidate: turning is the cheapest motion.
-    voxels = np.unique(np.concatenate([space.start[None], coarse_positions(space, settings)]), axis=0)
+    seeing = target_positions(space, field, motion, settings)
+    voxels = np.unique(np.concatenate([space.start[None], coarse_positions(space, settings), seeing]), axis=0)
     rewards = sphere_rewards(field, positions_world(space, voxels, T_world_camera), directions)
     utility = utilities(voxels, rewards)
     top = np.argsort(-utility.max(axis=1), kind="stable")[: settings.refine_top]

@@ -24,13 +24,24 @@ class PlanningSettings(Settings):
     fine_spacing_m: float = Field(0.25, gt=0, description="spacing of the positions around the best coarse ones, m")
     max_positions: int = Field(400, ge=1, description="coarse positions at most; the spacing grows to keep to it")
     refine_top: int = Field(4, ge=0, description="coarse positions that are refined")
+    max_targets: int = Field(
+        48, ge=0, description="places of value whose best viewpoints are sought among all positions, beside the lattice"
+    )
+    target_block_m: float = Field(0.3, gt=0, description="edge of the blocks that value is gathered in for that, m")
     num_yaws: int = Field(24, ge=1, description="view directions around the vertical, evenly spread")
-    pitches_deg: tuple[float, ...] = Field((-35.0, 0.0, 30.0), min_length=1, description="view pitch, degrees, up > 0")
+    pitches_deg: tuple[float, ...] = Field(
+        (-60.0, -30.0, 0.0, 30.0, 60.0), min_length=1, description="view pitch, degrees, up > 0"
+    )
     max_range_m: float = Field(5.0, gt=0, description="how far a view is expected to see, m")
     exact_top: int = Field(24, ge=1, description="candidates whose visible set is computed exactly")
     unknown_free_path_m: float = Field(
         1.0, gt=0, description="mean length of a ray through unknown space before something stops it, m"
     )
+    side_weight: float = Field(
+        0.0, ge=0, description="worth of seeing a surface voxel from a side it was not seen from, against bringing it "
+        "from unseen to seen well enough; 0 = sides do not count"
+    )
+    side_views: int = Field(128, ge=1, description="walked poses that the sides seen so far are found from")
     credit_views: int = Field(48, ge=0, description="walked poses searched for looks that brought nothing")
     credit_factor: float = Field(
         0.5, gt=0, le=1, description="what each look that brought nothing leaves of a voxel's expected gain"
@@ -45,7 +56,10 @@ class PlanningSettings(Settings):
     commitment: float = Field(
         1.25, ge=1, description="factor on the utility of going on to the goal of the decision before"
     )
-    stop_reward: float = Field(8.0, ge=0, description="stop when no reachable view has a higher expected reward")
+    stop_reward: float = Field(
+        1.0, ge=0, description="stop when no reachable view has a higher expected reward; 1 = what discovering two "
+        "voxels brings, the tolerance of the stop rule"
+    )
     max_steps_per_round: int = Field(20, ge=1, description="steps of one decision at most; longer paths are cut")
     min_steps_per_round: int = Field(
         10, ge=1, description="a shorter path is continued to the next view, seen from its end"

@@ -4,7 +4,7 @@
 uncertainty volume and the poses walked so far, never the scene.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from active3d_pipe.planning.candidates import Directions, view_directions
 from active3d_pipe.planning.choice import Pool, looks_along, reward_density, score, utility_rate, view_cost_steps
 from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.free_space import FreeSpace, build_free_space
+from active3d_pipe.planning.outcome import account_terms, expected_along
 from active3d_pipe.planning.path import look_around, step_path
 from active3d_pipe.planning.reward import RewardField, build_reward_field, exact_terms
 from active3d_pipe.planning.rrt_star import PlannedPath, plan_path
@@ -86,6 +87,16 @@ def decide(
     field = build_reward_field(volume, walked, camera, settings)
     directions = view_directions(camera, settings.num_yaws, settings.pitches_deg)
     task = _Task(volume.round, T, camera, directions, motion, settings, rng)
+    decision = _choose(task, volume, walked, field, previous)
+    promised = expected_along(field, decision.path, camera)
+    return replace(decision, terms={**decision.terms, **account_terms(volume, promised, previous)})
+
+
+def _choose(
+    task: _Task, volume: UncertaintyVolume, walked: np.ndarray, field: RewardField, previous: Decision | None
+) -> Decision:
+    """The decision itself, without the account of predicted and realised gain."""
+    T, camera, motion, settings = task.T, task.camera, task.motion, task.settings
     best = 0.0
     for relaxed in (False, True):
         space = build_free_space(volume, T, walked[:, :3, 3], motion, settings, relaxed=relaxed)

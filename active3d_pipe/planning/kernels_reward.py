@@ -32,10 +32,24 @@ def surface_share(normal, v, dx, dy, dz, voxel_size, t, quality, enough, quality
     return max(ZERO, min(new, enough) - quality[v]) / enough, cos
 
 
+@njit(fastmath=True, cache=True, inline="always")
+def heading(dx, dy, dz):
+    """Bit of the octant that a ray heads into: above and below, left and right are told apart."""
+    return np.uint8(1 << ((dx > 0) + 2 * (dy > 0) + 4 * (dz > 0)))
+
+
+@njit(fastmath=True, cache=True, inline="always")
+def side_share(sides, v, dx, dy, dz, t, enough, quality_range, side_weight):
+    """What a look at a surface voxel from an octant that it was not seen from is worth, full up to enough distance."""
+    if sides[v] & heading(dx, dy, dz):
+        return ZERO
+    return side_weight * min(ONE, quality_range / (max(t, np.float32(1e-3)) * enough))
+
+
 @njit(parallel=True, fastmath=True, cache=True)
 def sphere_gain(
-    positions, directions, solid_angles, kind, skip, value, through, surface_value, quality, normal, shape,
-    voxel_size, max_range, enough, quality_range,
+    positions, directions, solid_angles, kind, skip, value, through, surface_value, quality, normal, sides, shape,
+    voxel_size, max_range, enough, quality_range, side_weight,
 ):
     """Expected reward that arrives at each position from each direction of a sphere of rays.
 
@@ -71,6 +85,7 @@ def sphere_gain(
                     share, cos = surface_share(
                         normal, v, dx, dy, dz, voxel_size, t, quality, enough, quality_range
                     )
+                    share += side_share(sides, v, dx, dy, dz, t, enough, quality_range, side_weight)
                     total += transmittance * surface_value[v] * share * area / max(cos, LEAST_COS)
                     break
                 total += transmittance * value[v] * area
@@ -84,8 +99,8 @@ def sphere_gain(
 
 @njit(parallel=True, fastmath=True, cache=True)
 def frustum_gain(
-    origins, rotations, fan, opaque, kind, value, log_through, surface_value, quality, normal, gain_imp, gain_exp,
-    shape, voxel_size, max_range, enough, quality_range,
+    origins, rotations, fan, opaque, kind, value, log_through, surface_value, quality, normal, sides, gain_imp,
+    gain_exp, shape, voxel_size, max_range, enough, quality_range, side_weight,
 ):
     """Exact sums over the unique visible voxels of every candidate view.
 
@@ -130,8 +145,9 @@ def frustum_gain(
                             share, _ = surface_share(
                                 normal, v, dx, dy, dz, voxel_size, t, quality, enough, quality_range
                             )
-                            out[c, 0] += transmittance * surface_value[v] * share
-                            out[c, 1] += transmittance * surface_value[v] * share
+                            side = side_share(sides, v, dx, dy, dz, t, enough, quality_range, side_weight)
+                            out[c, 0] += transmittance * surface_value[v] * (share + side)
+                            out[c, 1] += transmittance * surface_value[v] * (share + side)
                             if quality[v] < enough:
                                 # gain_* hold what a perfect look would bring; this one brings a part of it.
                                 part = transmittance * share / (ONE - quality[v] / enough)
@@ -143,6 +159,87 @@ def frustum_gain(
                         if transmittance < LEAST_TRANSMITTANCE:
                             break
     return out
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+def path_gain(
+    origins, rotations, fan, opaque, kind, log_through, quality, normal, gain_imp, gain_exp, shape, voxel_size,
+    max_range, enough, quality_range,
+):
+    """(gain_imp, gain_exp) of all poses together, float64: every voxel once, at the best of its looks.
+
+    Arguments as of `frustum_gain`.
+    """
+    nx, ny, nz = shape
+    chunks = 2
+    best = np.zeros((chunks, nx * ny * nz), np.float32)
+    for chunk in prange(chunks):
+        ids = np.empty(nx + ny + nz + 3, np.int32)
+        for c in range(chunk, origins.shape[0], chunks):
+            R = rotations[c]
+            ox, oy, oz = origins[c, 0], origins[c, 1], origins[c, 2]
+            for r in range(fan.shape[0]):
+                x, y, z = fan[r, 0], fan[r, 1], fan[r, 2]
+                dx = (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z) / voxel_size
+                dy = (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z) / voxel_size
+                dz = (R[2, 0] * x + R[2, 1] * y + R[2, 2] * z) / voxel_size
+                n = walk_ray(opaque, ox, oy, oz, dx, dy, dz, max_range, nx, ny, nz, ids)
+                transmittance, depth = ONE, ZERO
+                piece = ONE / (voxel_size * (abs(dx) + abs(dy) + abs(dz)))
+                for m in range(n):
+                    v = ids[m]
+                    if kind[v] == 0:
+                        continue
+                    if kind[v] == 1:
+                        best[chunk, v] = max(best[chunk, v], transmittance)
+                    elif quality[v] < enough:
+                        a = np.float32(v // (ny * nz)) + np.float32(0.5) - ox
+                        b = np.float32((v // nz) % ny) + np.float32(0.5) - oy
+                        d = np.float32(v % nz) + np.float32(0.5) - oz
+                        t = voxel_size * np.sqrt(a * a + b * b + d * d)
+                        share, _ = surface_share(normal, v, dx, dy, dz, voxel_size, t, quality, enough, quality_range)
+                        best[chunk, v] = max(best[chunk, v], transmittance * share / (ONE - quality[v] / enough))
+                    depth += log_through[v] * (piece if kind[v] == 1 else ONE)
+                    transmittance = np.exp(depth)
+                    if transmittance < LEAST_TRANSMITTANCE:
+                        break
+    out = np.zeros(2, np.float64)
+    for v in range(nx * ny * nz):
+        share = max(best[0, v], best[1, v])
+        if share > ZERO:
+            out[0] += share * gain_imp[v]
+            out[1] += share * gain_exp[v]
+    return out
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+def mark_sides(origins, rotations, fan, kind, skip, shape, voxel_size, max_range):
+    """Octants (`heading`) that rays of past views came in by at the surface voxel they ended in, (size,) uint8."""
+    nx, ny, nz = shape
+    chunks = 2
+    seen = np.zeros((chunks, nx * ny * nz), np.uint8)
+    for chunk in prange(chunks):
+        for c in range(chunk, origins.shape[0], chunks):
+            R = rotations[c]
+            ox, oy, oz = origins[c, 0], origins[c, 1], origins[c, 2]
+            for r in range(fan.shape[0]):
+                x, y, z = fan[r, 0], fan[r, 1], fan[r, 2]
+                dx = (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z) / voxel_size
+                dy = (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z) / voxel_size
+                dz = (R[2, 0] * x + R[2, 1] * y + R[2, 2] * z) / voxel_size
+                t = np.float32(0.5) * voxel_size
+                while t < max_range:
+                    i = np.int32(np.floor(ox + t * dx))
+                    j = np.int32(np.floor(oy + t * dy))
+                    k = np.int32(np.floor(oz + t * dz))
+                    if i < 0 or j < 0 or k < 0 or i >= nx or j >= ny or k >= nz:
+                        break
+                    v = (i * ny + j) * nz + k
+                    if kind[v] == 2:
+                        seen[chunk, v] |= heading(dx, dy, dz)
+                        break
+                    t += voxel_size * np.float32(max(1, skip[v]) if kind[v] == 0 else 1)
+    return seen[0] | seen[1]
 
 
 @njit(parallel=True, cache=True)

@@ -20,6 +20,14 @@ def surface_share(field: RewardField, v: int, direction: np.ndarray, distance_m:
     return max(0.0, min(new, enough) - float(field.quality[v])) / enough, cos
 
 
+def side_share(field: RewardField, v: int, direction: np.ndarray, distance_m: float) -> float:
+    """What a look from a side that surface voxel `v` was not seen from is worth."""
+    octant = sum(2**axis for axis in range(3) if direction[axis] > 0)
+    if field.sides[v] & 2**octant:
+        return 0.0
+    return field.side_weight * min(1.0, field.quality_range_m / (distance_m * field.enough_quality))
+
+
 def exact_terms(field: RewardField, T_world_camera: np.ndarray, fan: np.ndarray) -> GainTerms:
     """Gain of one view over its unique visible voxels; fan (M, 3) unit rays in the camera frame."""
     grid = field.grid
@@ -43,7 +51,8 @@ def exact_terms(field: RewardField, T_world_camera: np.ndarray, fan: np.ndarray)
                 elif field.kind[v] == SURFACE:
                     distance = grid.voxel_size * float(np.linalg.norm(np.asarray(ijk) + 0.5 - origin))
                     share, _ = surface_share(field, v, direction, distance)
-                    surface += transmittance * field.surface_value[v] * share
+                    side = side_share(field, v, direction, distance)
+                    surface += transmittance * field.surface_value[v] * (share + side)
                     left = 1 - field.quality[v] / field.enough_quality
                     if left > 0:
                         imp += transmittance * share / left * field.gain_imp[v]
@@ -71,6 +80,7 @@ def sphere_gain(field: RewardField, position: np.ndarray, rays: np.ndarray, soli
             area = angle * (t / size) ** 2
             if field.kind[v] == SURFACE:
                 share, cos = surface_share(field, v, direction, t)
+                share += side_share(field, v, direction, t)
                 out[r] += transmittance * field.surface_value[v] * share * area / max(cos, LEAST_COS)
                 break
             if field.kind[v] != FREE:

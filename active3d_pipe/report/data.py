@@ -104,6 +104,8 @@ class DecisionRow:
     risk: float | None = None
     steps: int | None = None
     candidates: int | None = None
+    realised_imp_bits: float | None = None
+    realised_exp_bits: float | None = None
 
 
 @dataclass(frozen=True, eq=False)

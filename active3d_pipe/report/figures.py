@@ -160,15 +160,26 @@ def fusion(history: FusionHistory, scale: float) -> str:
 
 
 def gains(rows: Sequence[DecisionRow], scale: float) -> str:
-    """Predicted gain of both branches, stacked, beside the realised one, for every decision."""
+    """Predicted gain of both branches, stacked, beside the realised one, for every decision; both against each other
+    where the outcome is known by branch."""
     rounds = np.array([r.round for r in rows])
     imp, exp, real = (
         np.array([np.nan if v is None else v for v in column], dtype=np.float64)
         for column in zip(*((r.gain_imp_bits, r.gain_exp_bits, r.realised_bits) for r in rows))
     )
 
+    outcomes = [
+        (r.gain_imp_bits, r.realised_imp_bits, r.gain_exp_bits, r.realised_exp_bits)
+        for r in rows
+        if None not in (r.gain_imp_bits, r.realised_imp_bits, r.gain_exp_bits, r.realised_exp_bits)
+    ]
+
     def paint(figure: Figure) -> None:
-        axes = figure.add_subplot()
+        axes = figure.add_subplot(1, 1, 1)
+        if len(outcomes) > 2:
+            figure.clear()
+            axes, compared = figure.subplots(1, 2, width_ratios=[3, 1])
+            _paint_outcomes(compared, np.array(outcomes, dtype=np.float64))
         base = np.nan_to_num(imp)
         axes.bar(rounds, base, width=0.75, color=SERIES[0], label="predicted, implicit branch")
         axes.bar(rounds, np.nan_to_num(exp), width=0.75, bottom=base, color=SKY, label="predicted, explicit branch")
@@ -181,6 +192,19 @@ def gains(rows: Sequence[DecisionRow], scale: float) -> str:
         axes.margins(y=0.2)
 
     return draw(11.4, 2.9, paint, scale, "Predicted and realised information gain")
+
+
+def _paint_outcomes(axes: Axes, outcomes: np.ndarray) -> None:
+    """Realised over predicted bits of every decision (N, 4), one mark for each branch; on the diagonal it came true."""
+    for i, (label, color, marker) in enumerate((("implicit", SERIES[0], "o"), ("explicit", SKY, "^"))):
+        predicted, realised = outcomes[:, 2 * i], outcomes[:, 2 * i + 1]
+        ranks = [np.argsort(np.argsort(a)) for a in (predicted, realised)]
+        rank = float(np.atleast_2d(np.corrcoef(np.stack(ranks)))[0, 1])
+        axes.scatter(predicted, realised, s=14, color=color, marker=marker, label=f"{label}, rank corr. {rank:.2f}")
+    top = float(outcomes.max())
+    axes.plot([0, top], [0, top], color=MUTED, linewidth=0.8)
+    axes.set(title="Came true?", xlabel="predicted [bit]", ylabel="realised [bit]")
+    axes.legend(fontsize=7)
 
 
 def timings(rows: Sequence[Timing], scale: float) -> str:

@@ -166,7 +166,7 @@ def test_a_narrow_door_is_passed_with_less_clearance():
     poor = ~inside & (x > 1.7) & (x < 2.3) & ((y < 0.1) | (y > 1.9))
     volume["view_quality"][poor] = 0
     T = se3.pose_from_yaw_pitch(np.array([0.825, 1.025, 1.025]), np.pi, 0.0)
-    settings = PlanningSettings(stop_reward=20.0, clearance_margin_m=0.15)
+    settings = PlanningSettings(stop_reward=30.0, clearance_margin_m=0.15)
     d = take(world, T[None], volume=volume, settings=settings)
     assert d.reason is Reason.RELAXED
     assert d.ranking[d.chosen].T_world_camera[0, 3] > 1.5

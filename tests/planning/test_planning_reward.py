@@ -98,7 +98,8 @@ def test_grazed_surface_gains_from_a_frontal_view_but_not_from_another_grazing_o
     along = se3.pose_from_yaw_pitch(np.array([0.4, 2.7, 0.8]), 0.0, 0.0)
     for yaw in np.arange(0, 6.28, 0.6):
         world.capture(se3.pose_from_yaw_pitch(along[:3, 3], yaw, 0.0))
-    field = build_reward_field(world.volume(), along[None], world.camera, PlanningSettings(credit_views=0))
+    settings = PlanningSettings(credit_views=0)
+    field = build_reward_field(world.volume(), along[None], world.camera, settings)
     frontal = se3.pose_from_yaw_pitch(np.array([2.0, 1.7, 0.8]), np.pi / 2, 0.0)
     grazing = se3.pose_from_yaw_pitch(np.array([0.5, 2.7, 0.8]), 0.0, 0.0)
     terms = exact_terms(field, np.stack([frontal, grazing]), world.camera)
@@ -142,3 +143,25 @@ def test_spread_poses_are_distinct_and_start_with_the_newest():
 
 def test_kind_constants_match_the_kernels():
     assert (FREE, OPEN, SURFACE) == (0, 1, 2)
+
+
+def test_a_side_that_was_not_seen_is_worth_a_look():
+    """The underside of a table top seen from above only; from below it is no news a second time."""
+    world = box_world.build((3.0, 3.0, 2.0), [((1.0, 1.0, 1.0), (2.0, 2.0, 1.04))])
+    above = [se3.pose_from_yaw_pitch(np.array([0.4, 0.4, 1.6]), y, -0.4) for y in np.arange(0, 6.28, 0.5)]
+    low = [se3.pose_from_yaw_pitch(np.array([2.6, 0.4, 0.5]), y, -0.3) for y in np.arange(0, 6.28, 0.5)]
+    for T in (*above, *low):
+        world.capture(T)
+    under = se3.pose_from_yaw_pitch(np.array([0.6, 0.6, 0.3]), np.pi / 4, 0.6)
+    settings = PlanningSettings(credit_views=0, side_weight=0.3)
+    before = build_reward_field(world.volume(), np.array(above), world.camera, settings)
+    after = build_reward_field(world.volume(), np.array([*above, under]), world.camera, settings)
+    never = build_reward_field(world.volume(), np.array(above), world.camera, PlanningSettings(credit_views=0))
+    a, b, c = (exact_terms(f, under[None], world.camera)[0].surface for f in (before, after, never))
+    assert a > b + 5
+    assert a > c + 5
+    n = before.grid.index_of(np.array([[1.1, 1.1, 1.02], [1.9, 1.9, 1.02]]))
+    table = tuple(slice(a, b + 1) for a, b in n.T)
+    upwards = 16 + 32 + 64 + 128
+    assert not (before.sides.reshape(before.grid.shape)[table] & upwards).any()
+    assert (after.sides.reshape(before.grid.shape)[table] & upwards).any()

@@ -1,0 +1,58 @@
+"""Candidate positions that are sought from what there is to see, where a lattice would miss them."""
+
+import numpy as np
+
+from active3d_pipe.information.gain import FREE, SURFACE
+from active3d_pipe.planning import kernels_targets
+from active3d_pipe.planning.config import PlanningSettings
+from active3d_pipe.planning.free_space import FreeSpace
+from active3d_pipe.planning.reward import RewardField
+from active3d_pipe.structures.motion import MotionSettings
+
+
+def target_positions(
+    space: FreeSpace, field: RewardField, motion: MotionSettings, settings: PlanningSettings
+) -> np.ndarray:
+    """(P, 3) int64 reachable voxels from which the most valuable places that are left can be seen.
+
+    A lattice of positions misses what can be seen through a gap only. Here one asks the other way round: blocks of
+    `target_block_m` with the most that is still to be had, and from where each is seen best and soonest.
+    """
+    grid = space.grid
+    targets = _targets(field, settings)
+    lattice = tuple(slice(o % 2, None, 2) for o in space.start)
+    places = np.argwhere(space.reachable[lattice]) * 2 + np.array([o % 2 for o in space.start])
+    if len(targets) == 0 or len(places) == 0:
+        return np.zeros((0, 3), np.int64)
+    enough = settings.information.enough_distance_m
+    near = kernels_targets.best_viewpoints(
+        targets.astype(np.int32), places.astype(np.int32), field.opaque, field.through, field.normal, grid.shape,
+        np.float32(1.5), np.float32(field.max_range_m / grid.voxel_size), np.float32(enough / grid.voxel_size),
+        space.cost[tuple(places.T)] / np.float32(motion.max_step_m), np.float32(settings.view_steps),
+    )
+    chosen = np.unique(near[near >= 0])
+    return places[chosen]
+
+
+def _targets(field: RewardField, settings: PlanningSettings) -> np.ndarray:
+    """(T, 3) int64: of each of the most valuable blocks the voxel with the most value beside seen free space."""
+    grid = field.grid
+    kind = field.kind.reshape(grid.shape)
+    free = kind == FREE
+    beside = np.zeros(grid.shape, bool)
+    for axis in range(3):
+        a, b = np.moveaxis(beside, axis, 0), np.moveaxis(free, axis, 0)
+        a[1:] |= b[:-1]
+        a[:-1] |= b[1:]
+    rest = np.maximum(0, 1 - field.quality / np.float32(field.enough_quality))
+    worth = np.where(field.kind == SURFACE, field.surface_value * rest, field.value) * beside.ravel()
+    ids = np.flatnonzero(worth > 0)
+    ijk = np.stack(np.unravel_index(ids, grid.shape), axis=-1)
+    block = max(1, round(settings.target_block_m / grid.voxel_size))
+    shape = tuple(n // block + 1 for n in grid.shape)
+    key = np.ravel_multi_index(tuple((ijk // block).T), shape)
+    total = np.bincount(key, weights=worth[ids], minlength=int(np.prod(shape)))
+    order = np.lexsort((ids, -worth[ids], key))
+    first = order[np.unique(key[order], return_index=True)[1]]
+    best = np.argsort(-total[key[first]], kind="stable")[: settings.max_targets]
+    return ijk[first[best]]

@@ -1,0 +1,78 @@
+import box_world
+import numpy as np
+import pytest
+
+from active3d_pipe.geometry import se3
+from active3d_pipe.planning import kernels_targets
+from active3d_pipe.planning.config import PlanningSettings
+from active3d_pipe.planning.free_space import build_free_space
+from active3d_pipe.planning.reward import build_reward_field
+from active3d_pipe.planning.targets import target_positions
+from active3d_pipe.structures.motion import MotionSettings
+
+SETTINGS, MOTION = PlanningSettings(), MotionSettings()
+
+
+def reference_viewpoints(targets, places, opaque, through, normal, shape, nearest, farthest, falloff, steps, fixed):
+    """The obvious loop."""
+    out = []
+    for t in targets:
+        looks = np.full(len(places), -1.0)
+        for n, p in enumerate(places):
+            d = (p - t).astype(float)
+            distance = np.linalg.norm(d)
+            if not nearest <= distance <= farthest:
+                continue
+            m = int(np.ceil(distance))
+            cells = [tuple(np.floor(t + i / m * d + 0.5).astype(int)) for i in range(1, m)]
+            cells = [c for c in dict.fromkeys(cells) if c != tuple(t)]
+            ids = [np.ravel_multi_index(c, shape) for c in cells]
+            passed = np.prod([0.0 if opaque[v] else through[v] for v in ids])
+            side = normal[np.ravel_multi_index(tuple(t), shape)].astype(float)
+            cos = side @ d / (np.linalg.norm(side) * distance) if np.linalg.norm(side) > 1 else 1.0
+            if passed >= 0.05:
+                looks[n] = passed * min(1, falloff / distance) * cos
+        seen = looks > 0.05
+        rate = looks / (steps + fixed)
+        out.append((np.where(seen, looks, -1), np.where(seen, rate, -1)))
+    return out
+
+
+def test_best_viewpoints_equal_the_reference():
+    rng = np.random.default_rng(1)
+    shape = (14, 12, 9)
+    opaque = (rng.random(shape) < 0.06).view(np.uint8).ravel()
+    through = np.where(opaque, 0, rng.choice([1.0, 0.8], opaque.shape)).astype(np.float32)
+    normal = np.where(rng.random((opaque.size, 1)) < 0.5, rng.integers(-90, 90, (opaque.size, 3)), 0).astype(np.int8)
+    places = np.stack([rng.integers(0, n, 150) for n in shape], -1).astype(np.int32)
+    targets = np.stack([rng.integers(0, n, 20) for n in shape], -1).astype(np.int32)
+    steps = rng.uniform(0, 40, len(places)).astype(np.float32)
+    args = (np.float32(1.5), np.float32(9), np.float32(4), steps, np.float32(10))
+    got = kernels_targets.best_viewpoints(targets, places, opaque, through, normal, shape, *args)
+    want = reference_viewpoints(targets, places, opaque, through, normal, shape, *args)
+    assert (got >= 0).all(axis=1).sum() > 10
+    for (a, b), (looks, rates) in zip(got, want, strict=True):
+        for chosen, values in ((a, looks), (b, rates)):
+            if chosen < 0:
+                assert values.max() < 0
+            else:
+                assert values[chosen] == pytest.approx(values.max(), rel=1e-4)
+
+
+def test_positions_that_see_what_is_left_are_found():
+    """A niche that can be looked into from in front only: a lattice may miss it, the search from the niche does not."""
+    niche = [((2.0, 0.0, 0.0), (2.2, 1.0, 2.0)), ((2.0, 1.3, 0.0), (2.2, 2.2, 2.0)), ((2.2, 0.0, 0.0), (3.4, 0.9, 2.0)),
+             ((2.2, 1.4, 0.0), (3.4, 2.2, 2.0))]  # fmt: skip
+    world = box_world.build((3.4, 2.2, 2.0), niche)
+    start = np.array([0.6, 0.5, 1.0])
+    poses = np.array([se3.pose_from_yaw_pitch(start, a, p) for a in np.arange(0, 6.28, 0.5) for p in (-0.5, 0.5)])
+    for T in poses:
+        world.capture(T)
+    volume = world.volume()
+    field = build_reward_field(volume, poses, world.camera, SETTINGS)
+    space = build_free_space(volume, poses[-1], poses[:, :3, 3], MOTION, SETTINGS)
+    found = space.grid.centre_of(target_positions(space, field, MOTION, SETTINGS))
+    assert space.reachable[tuple(space.grid.index_of(found).T)].all()
+    assert ((np.abs(found[:, 1] - 1.15) < 0.25) & (found[:, 0] > 0.8)).any()
+    none = PlanningSettings(max_targets=0)
+    assert len(target_positions(space, field, MOTION, none)) == 0
