@@ -17,6 +17,7 @@ from PIL import Image
 from active3d_pipe.structures import Camera
 
 NODE = Path(__file__).parent / "node"
+CHROMIUM = os.environ.get("ACTIVE3D_CHROMIUM", "chromium")
 ICD = Path(os.environ.get("ACTIVE3D_SWIFTSHADER", "/usr/lib/chromium/vk_swiftshader_icd.json"))
 
 
@@ -31,7 +32,8 @@ def need_module(name: str) -> None:
     need(importlib.util.find_spec(name), f"the Python package {name}", "pip install -c constraints.txt -e '.[interop]'")
 
 
-def _run(command: list[object], env: dict[str, str] | None = None) -> str:
+def run_program(command: list[object], env: dict[str, str] | None = None) -> str:
+    """What the program prints; an exit code other than 0 fails the test with what it said."""
     done = subprocess.run(
         list(map(str, command)), capture_output=True, text=True, check=False, env={**os.environ, **(env or {})}
     )
@@ -39,7 +41,7 @@ def _run(command: list[object], env: dict[str, str] | None = None) -> str:
     return done.stdout
 
 
-def _node_package(name: str) -> Path:
+def node_package(name: str) -> Path:
     need(shutil.which("node"), "Node.js 20 or newer", "apt install nodejs npm")
     folder = NODE / "node_modules" / name
     need(folder.is_dir(), f"the npm package {name}", "npm ci --prefix tests/interop/node")
@@ -52,8 +54,8 @@ def node_script() -> Callable[..., Any]:
 
     def run(script: str, packages: list[str], *arguments: object) -> Any:
         for name in packages:
-            _node_package(name)
-        return json.loads(_run(["node", NODE / script, *arguments]))
+            node_package(name)
+        return json.loads(run_program(["node", NODE / script, *arguments]))
 
     return run
 
@@ -66,8 +68,8 @@ def rerun(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., str]:
     need(program, "the program rerun", "pip install -c constraints.txt -e '.[interop]'")
     home = str(tmp_path_factory.mktemp("rerun_home"))
     env = {"HOME": home, "XDG_CONFIG_HOME": home, "XDG_DATA_HOME": home}
-    _run([program, "analytics", "disable"], env)
-    return lambda *arguments: _run([program, *arguments], env)
+    run_program([program, "analytics", "disable"], env)
+    return lambda *arguments: run_program([program, *arguments], env)
 
 
 @pytest.fixture(scope="session")
@@ -77,7 +79,7 @@ def splat_transform(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path,
     It turns every .ply by 180 degrees about Z, so the camera is given in that frame. Version 2.7.1 draws next to
     nothing in images of fewer than 257 tiles of 16 x 16 pixels (all of 320 x 180, for instance), hence the check.
     """
-    program = _node_package("@playcanvas/splat-transform") / "bin" / "cli.mjs"
+    program = node_package("@playcanvas/splat-transform") / "bin" / "cli.mjs"
     need(ICD.is_file(), f"SwiftShader, a Vulkan driver for CPUs ({ICD})", "apt install chromium (it ships one)")
     folder = tmp_path_factory.mktemp("splat_transform")
     # Debian's chromium ships the Vulkan loader beside the driver.
@@ -93,12 +95,41 @@ def splat_transform(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path,
 
         out = folder / "view.webp"
         fov = np.degrees(2 * np.arctan(0.5 * camera.height / camera.fy))
-        _run(
+        run_program(
             ["node", program, "-w", "-q", ply, f"--camera={vector(position)}",
              f"--look-at={vector(position + R[:, 2])}", f"--up={vector(-R[:, 1])}", "--fov", f"{fov:.9f}",
              "--near", camera.near, "--resolution", f"{camera.width}x{camera.height}", out],
             env,
         )
         return np.asarray(Image.open(out).convert("RGB"), np.float32) / np.float32(255)
+
+    return render
+
+
+@pytest.fixture(scope="session")
+def spark(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path, Camera, list[np.ndarray]], list[np.ndarray]]:
+    """Render views of a Gaussian .ply with Spark on three.js at its defaults, in a headless Chromium (SwiftShader).
+
+    Every view is (H, W, 3) float32 in 0..1. One page load draws all poses, since loading takes longer than drawing.
+    """
+    for name in ("@sparkjsdev/spark", "three"):
+        node_package(name)
+    program = shutil.which(CHROMIUM)
+    need(program, f"Chromium ({CHROMIUM}; ACTIVE3D_CHROMIUM names another)", "apt install chromium")
+    folder = tmp_path_factory.mktemp("spark")
+
+    def render(ply: Path, camera: Camera, poses: list[np.ndarray]) -> list[np.ndarray]:
+        job = {
+            "ply": str(ply.resolve()), "out": str(folder), "chromium": program, "width": camera.width,
+            "height": camera.height, "fov_deg": float(np.degrees(2 * np.arctan(0.5 * camera.height / camera.fy))),
+            "near": camera.near, "poses": [T.tolist() for T in poses],
+        }
+        (folder / "job.json").write_text(json.dumps(job), encoding="utf-8")
+        answer = json.loads(run_program(["node", NODE / "render_spark.mjs", folder / "job.json"]))
+        # What this test means depends on these defaults: a dilation of 0.3 px2 with opacity compensation.
+        assert (answer["blurAmount"], answer["preBlurAmount"]) == (0.3, 0)
+        shape = (camera.height, camera.width, 4)
+        views = [np.frombuffer((folder / f"view_{i}.rgba").read_bytes(), np.uint8) for i in range(len(poses))]
+        return [v.reshape(shape)[..., :3].astype(np.float32) / np.float32(255) for v in views]
 
     return render
