@@ -78,12 +78,12 @@ class ViewPolicy:
     commits = True
 
     def propose(self, context: PolicyContext, space: FreeSpace) -> Views:
-        """The candidate views; none when there is nothing left to look at."""
-        raise NotImplementedError
+        """The candidate views; none when there is nothing left to look at, as for who never looks for any."""
+        return Views.none()
 
     def score(self, context: PolicyContext, space: FreeSpace, views: Views) -> np.ndarray:
-        """(C,) the higher the better; -inf = no candidate."""
-        raise NotImplementedError
+        """(C,) the higher the better; -inf = no candidate. Without a rule of its own: the gain that `propose` found."""
+        return np.zeros(len(views)) if views.gain is None else views.gain
 
     def path(
         self, context: PolicyContext, space: FreeSpace, voxel: np.ndarray, targets: Sequence[np.ndarray]
