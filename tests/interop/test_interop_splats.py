@@ -1,4 +1,4 @@
-"""The exported Gaussians look as good in other programs as the map does in ours.
+"""The exported Gaussians look nearly as good in other programs as the map in ours.
 
 Two programs of the two kinds there are. splat-transform (PlayCanvas) adds 0.3 px2 to every projected covariance and
 lets the primitive grow, as the reference implementation of 3D Gaussian splatting does; Spark (three.js) adds as much
@@ -93,7 +93,7 @@ class Judge:
             assert a[part].mean() - b[part].mean() <= most_db, line
         # A wrong view, of another pose say, scores below 12 dB. A short run has not seen all that held-out views show.
         worst = min(a[: self.captured].min(), b[: self.captured].min())
-        assert worst > 20, f"{name} {size}: {a} dB ours, {b} dB theirs"
+        assert worst > 20, f"{name} {size}: ours {a}, theirs {b}"
 
 
 @pytest.fixture(scope="session")
