@@ -70,7 +70,7 @@ def _run(context: StageContext) -> None:
     )
     if not walk.frames:  # a blocked first step: the camera still looks from where it stands
         walk.frames.append(simulator.render(current, step=first_step, stamp_ns=first_step * capture_log.STEP_NS))
-    capture_log.write_frames(context.out / shared.LOG_NAME, walk.frames, path)
+    shared.save_frames(context.out, walk.frames, path)
     document = {
         "schema": "active3d.capture/1", "round": context.round, "first_step": first_step, "steps": len(walk.frames),
         "steps_total": first_step + len(walk.frames), "planned": len(path), "collisions": walk.collisions,

@@ -21,7 +21,10 @@ CACHE_BYTES = 1 << 29  # decoded frames kept in memory between the stages of one
 
 _frames: "OrderedDict[tuple, list[Frame]]" = OrderedDict()
 _simulators: "dict[str, Simulator]" = {}
-_newest_map: "list[tuple[tuple, HybridMap]]" = []  # at most one: what this process wrote last, and its files' identity
+# What this process wrote last, and the map before it (to look at only): with their files' identity, at most one each.
+_newest_map: "list[tuple[tuple, HybridMap]]" = []
+_previous_map: "list[tuple[tuple, HybridMap]]" = []
+MAP_NAMES = ("field.safetensors", "gaussians.safetensors", "optimiser.safetensors", "keyframes.json")
 
 
 def captures(last_round: int) -> tuple[NodeId, ...]:
@@ -34,16 +37,27 @@ def load_frames(folder: Path) -> "list[Frame]":
     from active3d_pipe.storage import capture_log
 
     path = folder / LOG_NAME
-    stat = path.stat() if path.exists() else None
-    key = (str(path), stat.st_ino, stat.st_mtime_ns, stat.st_size) if stat else (str(path),)
+    key = _identity([path])
     if key in _frames:
         _frames.move_to_end(key)
         return _frames[key]
     frames = capture_log.read_frames(path)
+    _keep_frames(key, frames)
+    return frames
+
+
+def save_frames(folder: Path, frames: "Sequence[Frame]", planned_path: np.ndarray) -> None:
+    """Write the log of a capture artifact, and keep the frames in memory as they will be read."""
+    from active3d_pipe.storage import capture_log
+
+    capture_log.write_frames(folder / LOG_NAME, frames, planned_path)
+    _keep_frames(_identity([folder / LOG_NAME]), [capture_log.as_logged(f) for f in frames])
+
+
+def _keep_frames(key: tuple, frames: "list[Frame]") -> None:
     _frames[key] = frames
     while len(_frames) > 1 and sum(f.rgb.nbytes + f.depth.nbytes for fs in _frames.values() for f in fs) > CACHE_BYTES:
         _frames.popitem(last=False)
-    return frames
 
 
 def load_spread(inputs: Mapping[NodeId, Path], last_round: int, most: int) -> "list[Frame]":
@@ -143,27 +157,37 @@ def save_map(folder: Path, hybrid: "HybridMap", *, to_train: bool = True) -> Non
     _newest_map.clear()
     if to_train:
         write_tensors(folder / "optimiser.safetensors", state["optimiser"])
-        _newest_map.append((_identity(folder), hybrid))
+        _newest_map.append((_map_identity(folder), hybrid))
 
 
-def _identity(folder: Path) -> tuple:
+def _identity(paths: "Sequence[Path]") -> tuple:
     """What tells these files from all others, wherever their folder is moved; empty when one is missing."""
-    names = ("field.safetensors", "gaussians.safetensors", "optimiser.safetensors", "keyframes.json")
     try:
-        stats = [(folder / name).stat() for name in names]
+        stats = [path.stat() for path in paths]
     except OSError:
         return ()
     return tuple((s.st_dev, s.st_ino, s.st_mtime_ns, s.st_size) for s in stats)
+
+
+def _map_identity(folder: Path) -> tuple:
+    return _identity([folder / name for name in MAP_NAMES])
 
 
 def load_map(folder: Path, inputs: Mapping[NodeId, Path], config: Any, *, to_train: bool = True) -> "HybridMap":
     """Read a map; its keyframes' images come from the capture logs among `inputs`.
 
     Without `to_train` the optimiser's state, two thirds of the bytes, stays on disk. The map that this process wrote
-    last is taken from memory: its state is that of its files. Who loads it `to_train` owns it.
+    last is taken from memory: its state is that of its files. Who loads it `to_train` owns it, and leaves a copy to
+    look at.
     """
-    if _newest_map and _newest_map[0][0] == _identity(folder) and _newest_map[0][1].settings == config.mapping:
-        return _newest_map.pop()[1] if to_train else _newest_map[0][1]
+    identity = _map_identity(folder)
+    for kept in (_newest_map, _previous_map):
+        if kept and kept[0][0] == identity and kept[0][1].settings == config.mapping:
+            if not to_train:
+                return kept[0][1]
+            if kept is _newest_map:
+                _previous_map[:] = [(identity, kept[0][1].to_look_at())]
+                return _newest_map.pop()[1]
     from active3d_pipe.mapping.hybrid_map import HybridMap
     from active3d_pipe.mapping.keyframes import Keyframe
     from active3d_pipe.storage.files import read_json, read_tensors

@@ -1,5 +1,6 @@
 """The hybrid scene state M_k = {F_theta, G_k} (paper, eq. hybrid_state) with all that a resume needs."""
 
+import copy
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
@@ -85,6 +86,12 @@ class HybridMap:
             "gaussians": {"values": gaussians["values"]},
             "optimiser": {**{f"field.{k}": v for k, v in self.optimiser.state().items()}, **moments},
         }
+
+    def to_look_at(self) -> "HybridMap":
+        """A copy that does not change with this map; it cannot be trained further."""
+        field = copy.deepcopy(self.field)
+        gaussians = GaussianParameters.from_values(self.gaussians.values.detach().numpy())
+        return HybridMap(field, FieldOptimiser(field, self.settings.field), gaussians, self.settings, self.keyframes)
 
     @classmethod
     def from_state(

@@ -6,6 +6,7 @@ Times are simulated, never wall clock: equal runs give equal bytes.
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +66,12 @@ def write_frames(path: Path, frames: Sequence[Frame], planned_path: np.ndarray) 
         writer.finish()
 
 
+def as_logged(frame: Frame) -> Frame:
+    """The frame that `read_frames` gives back for a written one: poses are logged as quaternions."""
+    T = _matrix(frame.T_world_camera[:3, 3], se3.quat_from_matrix(frame.T_world_camera[:3, :3]))
+    return replace(frame, T_world_camera=T)
+
+
 def read_frames(path: Path) -> list[Frame]:
     """Read the frames of a closed log, checksums verified; ArtifactError when it is damaged."""
     from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
@@ -104,12 +111,16 @@ def _frame(step: int, stamp_ns: int, found: dict, rgb: np.ndarray, near: float, 
     if rgb.shape != (camera.height, camera.width, 3):
         raise ArtifactError(f"step {step}: image of shape {rgb.shape} for a camera of {camera.width}x{camera.height}")
     depth = np.frombuffer(depth_message.data, "<f4").reshape(camera.height, camera.width).astype(np.float32)
-    pose = found[POSE].pose
-    T = np.eye(4)
-    q = pose.orientation
-    T[:3, :3] = se3.matrix_from_quat(np.array([q.w, q.x, q.y, q.z]))
-    T[:3, 3] = pose.position.x, pose.position.y, pose.position.z
+    p, q = found[POSE].pose.position, found[POSE].pose.orientation
+    T = _matrix(np.array([p.x, p.y, p.z]), np.array([q.w, q.x, q.y, q.z]))
     return Frame(step, stamp_ns, camera, T, rgb, depth)
+
+
+def _matrix(position: np.ndarray, quat: np.ndarray) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3] = se3.matrix_from_quat(quat)
+    T[:3, 3] = position
+    return T
 
 
 def _range_text(frames: Sequence[Frame]) -> str:

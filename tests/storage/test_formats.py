@@ -59,6 +59,10 @@ def test_capture_log_round_trip_and_same_bytes(tmp_path: Path) -> None:
         np.testing.assert_array_equal(a.rgb, b.rgb)
         np.testing.assert_array_equal(a.depth, b.depth)
         np.testing.assert_allclose(a.T_world_camera, b.T_world_camera, atol=1e-12)
+        # What a process keeps in memory instead of reading the log must be the same to the last bit.
+        kept = capture_log.as_logged(a)
+        assert kept.T_world_camera.tobytes() == b.T_world_camera.tobytes()
+        assert (kept.step, kept.stamp_ns, kept.camera) == (b.step, b.stamp_ns, b.camera)
 
 
 @pytest.mark.parametrize("damage", ["truncate", "flip", "empty", "missing"])
