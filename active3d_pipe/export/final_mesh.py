@@ -6,6 +6,7 @@ from typing import Protocol
 import numpy as np
 
 from active3d_pipe.export.config import MeshSettings
+from active3d_pipe.export.correction import corrected_sdf
 from active3d_pipe.export.isosurface import drop_small_components, extract_mesh
 from active3d_pipe.export.view_fusion import colour_from_views, colour_mesh, cull_unseen, near_readings
 from active3d_pipe.structures import Frame, TriangleMesh
@@ -34,7 +35,8 @@ def final_mesh(field: Surface, frames: Sequence[Frame], settings: MeshSettings) 
     """
     grid, observed = near_readings(frames, field.low, field.high, 2 * settings.voxel_size_m, settings.dilate_cells)
     whole = settings.model_copy(update={"min_component_m2": 0.0})
-    mesh = extract_mesh(field.query_sdf, field.low, field.high, whole, grid=grid, observed=observed)
+    query_sdf = corrected_sdf(field.query_sdf, field.low, field.high, frames, settings)
+    mesh = extract_mesh(query_sdf, field.low, field.high, whole, grid=grid, observed=observed)
     mesh = drop_small_components(cull_unseen(mesh, frames, settings), settings.min_component_m2)
     if settings.colour == "views":
         return colour_from_views(mesh, frames, settings, field.query_color)

@@ -1,0 +1,97 @@
+"""The field's SDF, replaced by fused depth readings where these contradict it: thin parts that the field washes out."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from scipy.ndimage import binary_dilation
+
+from active3d_pipe.export import kernels_correction as kernels
+from active3d_pipe.export.config import MeshSettings
+from active3d_pipe.geometry import projection
+from active3d_pipe.structures import Frame, VoxelGrid
+
+STRIDE = 4  # of the pixels, every how many are compared with the field
+MOST_FRAMES = 200  # evenly spread, that are compared with the field
+MOST_FUSED = 128  # frames that are fused: those with the most readings that contradict
+LEAST_READINGS = 3  # in a cell, for their mean to count
+
+
+def corrected_sdf(
+    query_sdf: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high: np.ndarray, frames: Sequence[Frame],
+    settings: MeshSettings,
+) -> Callable[[np.ndarray], np.ndarray]:
+    """`query_sdf`, but around readings where it is wrong the truncated signed distance of the readings.
+
+    Args:
+        query_sdf: (N, 3) float32 world points, m -> (N,) SDF, m, positive in free space.
+        low, high: (3,) corners of the box, world, m.
+        frames: logged frames with depth.
+        settings: `dispute_m`, the mean SDF at the readings of a cell of two marching-cubes cells from which they are
+            believed, not the field; 0 = never.
+
+    The SDF at a reading should be zero, noise aside, which the mean over the cell takes out. Where a sheet is thinner
+    than the field resolves, it stays positive on both sides and the surface is lost.
+    """
+    if settings.dispute_m <= 0 or not frames:
+        return query_sdf
+    grid, marks, loudest = _disputed(query_sdf, low, high, frames, settings)
+    if not marks.any():
+        return query_sdf
+    origin, inv_cell = grid.origin.astype(np.float32), np.float32(1 / grid.voxel_size)
+    fused = [frames[i] for i in loudest]
+    poses = np.stack([f.T_world_camera for f in fused]).astype(np.float32)
+    lenses = np.array([[f.camera.fx, f.camera.fy, f.camera.cx, f.camera.cy] for f in fused], np.float32)
+    views = (
+        np.stack([f.depth for f in fused]), np.ascontiguousarray(poses[:, :3, :3]),
+        np.ascontiguousarray(poses[:, :3, 3]), lenses,
+    )
+    near = np.float32(min(f.camera.near for f in fused))
+    truncation = np.float32(settings.fusion_truncation_cells * settings.voxel_size_m)
+
+    def query(points: np.ndarray) -> np.ndarray:
+        sdf = query_sdf(points)
+        chosen = np.empty(len(points), np.int64)
+        chosen = chosen[: kernels.points_in(points, origin, inv_cell, marks, chosen)]
+        if len(chosen):
+            measured = np.empty(len(chosen), np.float32)
+            kernels.projective_sdf(np.ascontiguousarray(points[chosen]), *views, near, truncation, measured)
+            known = ~np.isnan(measured)
+            sdf = sdf.copy()
+            sdf[chosen[known]] = measured[known]
+        return sdf
+
+    return query
+
+
+def _disputed(
+    query_sdf: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high: np.ndarray, frames: Sequence[Frame],
+    settings: MeshSettings,
+) -> tuple[VoxelGrid, np.ndarray, list[int]]:
+    """Grid, the cells (X, Y, Z) bool in and beside which readings contradict, and the frames that do so most."""
+    grid = VoxelGrid.from_bounds(low, high, 2 * settings.voxel_size_m)
+    origin, inv_cell = grid.origin.astype(np.float32), np.float32(1 / grid.voxel_size)
+    sums, counts = np.zeros(grid.shape, np.float32), np.zeros(grid.shape, np.int32)
+    compared = np.unique(np.linspace(0, len(frames) - 1, min(MOST_FRAMES, len(frames))).round().astype(int)).tolist()
+    against: list[int] = []
+    for index in compared:
+        points = _readings(frames[index])
+        values = query_sdf(points) if len(points) else np.zeros(0, np.float32)
+        kernels.add_readings(points, values, origin, inv_cell, sums, counts)
+        against.append(int((np.abs(values) > settings.dispute_m).sum()))
+    mean = np.abs(sums) / np.maximum(counts, 1)
+    marks = (counts >= LEAST_READINGS) & (mean > settings.dispute_m)
+    if marks.any():
+        marks = binary_dilation(marks, structure=np.ones((3, 3, 3), bool))
+    order = np.argsort(-np.array(against), kind="stable")[:MOST_FUSED]
+    return grid, marks, sorted(compared[int(i)] for i in order)
+
+
+def _readings(frame: Frame) -> np.ndarray:
+    """(N, 3) float32 world points of every `STRIDE`-th reading in range."""
+    step = slice(STRIDE // 2, None, STRIDE)
+    depth = frame.depth[step, step]
+    rays = projection.pixel_rays(frame.camera)[step, step]
+    valid = (depth > frame.camera.near) & (depth < frame.camera.far)
+    T = frame.T_world_camera
+    points = (depth[..., None] * rays)[valid] @ T[:3, :3].T + T[:3, 3]
+    return np.ascontiguousarray(points, np.float32)

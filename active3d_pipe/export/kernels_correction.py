@@ -1,0 +1,70 @@
+# mypy: ignore-errors
+"""Where logged readings contradict an SDF, and the truncated signed distance that the readings themselves give.
+
+`rotations` (F, 3, 3) are camera -> world, `centres` (F, 3) m, `lenses` (F, 4) fx fy cx cy, all float32.
+"""
+
+import numpy as np
+from numba import njit, prange
+
+
+@njit(cache=True)
+def add_readings(points, values, origin, inv_cell, sums, counts):
+    """Add values (N,) f32 and 1 to the cells of sums (X, Y, Z) f32 and counts i32 that points (N, 3) lie in."""
+    nx, ny, nz = counts.shape
+    for n in range(points.shape[0]):
+        x = np.int64(np.floor((points[n, 0] - origin[0]) * inv_cell))
+        y = np.int64(np.floor((points[n, 1] - origin[1]) * inv_cell))
+        z = np.int64(np.floor((points[n, 2] - origin[2]) * inv_cell))
+        if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
+            sums[x, y, z] += values[n]
+            counts[x, y, z] += 1
+
+
+@njit(cache=True)
+def points_in(points, origin, inv_cell, marks, chosen):
+    """Indices of the points (N, 3) in marked cells into chosen (N,) i64; returns how many."""
+    nx, ny, nz = marks.shape
+    count = 0
+    for n in range(points.shape[0]):
+        x = np.int64(np.floor((points[n, 0] - origin[0]) * inv_cell))
+        y = np.int64(np.floor((points[n, 1] - origin[1]) * inv_cell))
+        z = np.int64(np.floor((points[n, 2] - origin[2]) * inv_cell))
+        if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz and marks[x, y, z]:
+            chosen[count] = n
+            count += 1
+    return count
+
+
+@njit(parallel=True, cache=True)
+def projective_sdf(points, depths, rotations, centres, lenses, near, truncation, sdf):
+    """Mean over frames of depth reading minus depth of the point, clipped to the truncation; NaN where none counts.
+
+    A frame counts where the point is in its image, has a reading, and lies less than `truncation` behind it
+    (Curless and Levoy 1996). Near views weigh more, by 1 / z^2: their pixels are smaller. The farther behind its
+    reading, the less a frame weighs: on the far side of a thin sheet the views of that side decide.
+    """
+    height, width = depths.shape[1], depths.shape[2]
+    for n in prange(points.shape[0]):
+        total, weight = 0.0, 0.0
+        for f in range(depths.shape[0]):
+            dx, dy, dz = points[n, 0] - centres[f, 0], points[n, 1] - centres[f, 1], points[n, 2] - centres[f, 2]
+            z = rotations[f, 0, 2] * dx + rotations[f, 1, 2] * dy + rotations[f, 2, 2] * dz
+            if z < near:
+                continue
+            x = rotations[f, 0, 0] * dx + rotations[f, 1, 0] * dy + rotations[f, 2, 0] * dz
+            y = rotations[f, 0, 1] * dx + rotations[f, 1, 1] * dy + rotations[f, 2, 1] * dz
+            j = np.int64(np.floor(lenses[f, 0] * x / z + lenses[f, 2]))
+            i = np.int64(np.floor(lenses[f, 1] * y / z + lenses[f, 3]))
+            if i < 0 or j < 0 or i >= height or j >= width:
+                continue
+            d = depths[f, i, j]
+            ahead = d - z
+            if not d > 0.0 or ahead <= -truncation:
+                continue
+            w = 1.0 / (z * z)
+            if ahead < 0.0:
+                w *= (1.0 + ahead / truncation) ** 2
+            total += w * min(ahead, truncation)
+            weight += w
+        sdf[n] = total / weight if weight > 0.0 else np.nan
