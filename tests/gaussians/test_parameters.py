@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from active3d_pipe.errors import ArtifactError
+from active3d_pipe.gaussians import kernels_adam
 from active3d_pipe.gaussians.config import GaussianSettings
 from active3d_pipe.gaussians.losses import frame_loss
 from active3d_pipe.gaussians.optimisation import optimise_step
@@ -51,7 +52,7 @@ def test_adam_equals_torch_for_every_primitive_whenever_it_was_added() -> None:
     def reference(start: np.ndarray, grads: list[np.ndarray]) -> np.ndarray:
         columns = [torch.from_numpy(start[:, j].copy().astype(np.float64)).requires_grad_() for j in range(14)]
         groups = [{"params": [c], "lr": float(r)} for c, r in zip(columns, rates)]
-        optimiser = torch.optim.Adam(groups, eps=1e-15)
+        optimiser = torch.optim.Adam(groups, eps=float(kernels_adam.EPSILON))
         for g in grads:
             for j, c in enumerate(columns):
                 c.grad = torch.from_numpy(g[:, j].astype(np.float64))
