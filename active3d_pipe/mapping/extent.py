@@ -70,7 +70,7 @@ def _beyond(frame: Frame, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     c, R = frame.camera, frame.T_world_camera[:3, :3]
     i = np.arange(frame.step // STRIDE % STRIDE, c.height, STRIDE)
     j = np.arange(frame.step % STRIDE, c.width, STRIDE)
-    z = _clipped(frame.depth[np.ix_(i, j)], c.near, c.far)
+    z = _clipped(frame.depth[i[0] :: STRIDE, j[0] :: STRIDE], c.near, c.far)
     u, v = ((j + 0.5 - c.cx) / c.fx).astype(np.float32), ((i + 0.5 - c.cy) / c.fy).astype(np.float32)
     position = frame.T_world_camera[:3, 3]
     outside = np.zeros(z.shape, bool)
@@ -88,7 +88,8 @@ def _beyond(frame: Frame, low: np.ndarray, high: np.ndarray) -> np.ndarray:
 
 def _clipped(depth: np.ndarray, near: float, far: float) -> np.ndarray:
     """Depth in m up to `far`, 0 where there is no reading."""
-    return np.where(np.isfinite(depth) & (depth > 0) & (depth >= near), np.minimum(depth, np.float32(far)), 0)
+    reading = (depth > 0) & (depth >= np.float32(near)) & (depth < np.inf)  # a NaN is none either
+    return np.where(reading, np.minimum(depth, np.float32(far)), np.float32(0))
 
 
 def _agreeing(frame: Frame, rows: np.ndarray, columns: np.ndarray, z: np.ndarray) -> np.ndarray:
