@@ -33,7 +33,7 @@ class ExtentSettings(Settings):
     """The box of the map when `scene.bounds` is "auto": found in the depth readings, grown with them."""
 
     margin_m: float = Field(
-        0.2, gt=0, description="the box reaches at least this far beyond every depth reading, else it grows, m"
+        0.15, gt=0, description="the box reaches at least this far beyond every depth reading, else it grows, m"
     )
     chunk_m: float = Field(0.4, gt=0, description="a side of the box moves by multiples of this when it grows, m")
     max_extent_m: float = Field(40.0, gt=0, description="growth ends at this length of an edge of the box, m")

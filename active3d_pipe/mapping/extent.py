@@ -16,7 +16,7 @@ from active3d_pipe.structures import Frame
 STRIDE = 2  # every n-th pixel in x and y is looked at; which ones shifts with the step
 REACH = 2  # half size of the neighbourhood of a reading, px
 ENOUGH = 4  # readings of it that must agree: what a line of one pixel's width has
-AGREEMENT = 0.05  # relative difference of depths that agree; a floor at 10 m changes by 3 percent a pixel
+AGREEMENT = 0.03  # relative difference of depths that agree: along a row of the image a floor changes less, however far
 AROUND_CAMERA_M = 0.5  # the box holds this much around every camera
 FIRST_STEP_M = 0.1  # the first box fits what was seen to this length
 

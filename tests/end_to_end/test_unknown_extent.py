@@ -1,5 +1,6 @@
 """A run that is not told how large the scene is: `scene.bounds = "auto"`."""
 
+import json
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -14,18 +15,28 @@ from active3d_pipe.storage.files import read_json, read_tensors
 
 pytestmark = pytest.mark.timeout(1200)
 Cli = Callable[..., subprocess.CompletedProcess]
-# A camera that reads no farther than this has to walk to find the walls.
+# A short first look, then a turn on the spot: the room is discovered over several rounds.
 SETTINGS = (
-    "scene.bounds=auto", "camera.far=2.0", "run.steps=32", "export.viewer_iterations=0", "export.glb=false",
+    "scene.bounds=auto", "planning.bootstrap_turn_deg=20", "planning.policy=trajectory",
+    "planning.max_steps_per_round=18", "export.viewer_iterations=0", "export.glb=false",
     "mapping.refinement_iterations=5", "mapping.refinement_field_iterations=20", "evaluation.num_views=1",
     "evaluation.circle_views=0", "evaluation.train_views=1", "evaluation.curve_points=0", "evaluation.num_points=2000",
+    "run.steps=60",
 )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def auto_run(tiny_config: Path, run_cli: Cli) -> Path:
+    start = load_scene(SceneSettings(file=str(tiny_config.parent / "room" / "scene.glb"))).start_pose
+    turn = []
+    for angle in np.radians(np.arange(10, 361, 10)):
+        T = start.copy()
+        T[:2, :3] = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) @ start[:2, :3]
+        turn.append(T.tolist())
+    poses = tiny_config.parent / "turn.json"
+    poses.write_text(json.dumps(turn))
     run = tiny_config.parent / "auto"
-    options = [part for text in SETTINGS for part in ("--set", text)]
+    options = [part for text in (*SETTINGS, f"planning.trajectory={poses}") for part in ("--set", text)]
     done = run_cli("run", tiny_config, "--out", run, *options)
     assert done.returncode == 0, done.stderr
     return run
