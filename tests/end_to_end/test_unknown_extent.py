@@ -8,17 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from active3d_pipe.geometry.projection import unproject
 from active3d_pipe.sim.config import SceneSettings
 from active3d_pipe.sim.scene import load_scene
-from active3d_pipe.storage import meshes, volumes
+from active3d_pipe.storage import capture_log, meshes, volumes
 from active3d_pipe.storage.files import read_json, read_tensors
 
 pytestmark = pytest.mark.timeout(1200)
 Cli = Callable[..., subprocess.CompletedProcess]
-# A short first look, then a turn on the spot: the room is discovered over several rounds.
+# A short first look at the near wall, then a turn on the spot: the room is discovered over several rounds.
+LOOK_AT = (-2.6, 0.6, 1.3)
 SETTINGS = (
-    "scene.bounds=auto", "planning.bootstrap_turn_deg=20", "planning.policy=trajectory",
-    "planning.max_steps_per_round=18", "export.viewer_iterations=0", "export.glb=false",
+    "scene.bounds=auto", f"scene.start_look_at={list(LOOK_AT)}", "planning.bootstrap_turn_deg=20",
+    "planning.policy=trajectory", "planning.max_steps_per_round=18", "export.viewer_iterations=0", "export.glb=false",
     "mapping.refinement_iterations=5", "mapping.refinement_field_iterations=20", "evaluation.num_views=1",
     "evaluation.circle_views=0", "evaluation.train_views=1", "evaluation.curve_points=0", "evaluation.num_points=2000",
     "run.steps=60",
@@ -27,7 +29,8 @@ SETTINGS = (
 
 @pytest.fixture(scope="module")
 def auto_run(tiny_config: Path, run_cli: Cli) -> Path:
-    start = load_scene(SceneSettings(file=str(tiny_config.parent / "room" / "scene.glb"))).start_pose
+    file = tiny_config.parent / "room" / "scene.glb"
+    start = load_scene(SceneSettings(file=str(file), start_look_at=LOOK_AT)).start_pose
     turn = []
     for angle in np.radians(np.arange(10, 361, 10)):
         T = start.copy()
@@ -54,10 +57,15 @@ def test_the_box_grows_with_what_was_seen_and_holds_the_room_at_the_end(auto_run
     chunks = (found - found[0]) / 0.4
     assert np.abs(chunks).max() >= 1  # it did grow
     np.testing.assert_allclose(chunks, np.rint(chunks), atol=1e-5)
-    room = load_scene(SceneSettings(file=str(tiny_config.parent / "room" / "scene.glb")))
-    assert (found[-1][0] <= room.bounds_low + 0.05).all()
-    assert (found[-1][1] >= room.bounds_high - 0.05).all()
-    assert (found[-1][1] - found[-1][0] < room.bounds_high - room.bounds_low + 1.5).all()
+    room, walls = load_scene(SceneSettings(file=str(tiny_config.parent / "room" / "scene.glb"))), 0.35
+    assert (found[0][1] - found[0][0]).max() < 3  # a corner of the room
+    assert (found[-1][0] <= room.bounds_low + walls).all()
+    assert (found[-1][1] >= room.bounds_high - walls).all()
+    assert (found[-1][1] - found[-1][0] < room.bounds_high - room.bounds_low + 1).all()
+    for path in auto_run.glob("capture/*/frames.mcap"):
+        for frame in capture_log.read_frames(path):
+            points = unproject(frame.depth, frame.T_world_camera, frame.camera)[frame.depth > 0]
+            assert ((points > found[-1][0]) & (points < found[-1][1])).all(axis=1).mean() > 0.9999
 
 
 def test_every_artifact_of_a_round_is_in_its_box(auto_run: Path) -> None:
