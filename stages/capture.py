@@ -52,11 +52,9 @@ def _run(context: StageContext) -> None:
         start = simulator.scene.start_pose
         path = bootstrap_decision(start, config.motion, config.planning).path
         current, first_step = start, 0
-        low, high = simulator.scene.bounds_low, simulator.scene.bounds_high
-        rig = {
-            "scene": simulator.scene.name, "bounds": [[float(v) for v in low], [float(v) for v in high]],
-            "camera": asdict(simulator.camera),
-        }
+        corners = (simulator.scene.bounds_low, simulator.scene.bounds_high)
+        bounds = None if config.scene.bounds == "auto" else [[float(v) for v in corner] for corner in corners]
+        rig = {"scene": simulator.scene.name, "bounds": bounds, "camera": asdict(simulator.camera)}
     else:
         decision = Decision.from_json(read_json(context.input("planning", context.round - 1) / shared.DECISION_NAME))
         before = context.input("capture", context.round - 1)
@@ -85,7 +83,7 @@ def _run(context: StageContext) -> None:
 
 
 STAGE = Stage(
-    name="capture", version=2,
+    name="capture", version=3,
     config=("scene", "camera", "sensor", "motion", "planning.bootstrap_turn_deg", "planning.bootstrap_pitch_deg",
         "run.seed",),
     inputs=_inputs, run=_run, loop=True, parameters=_parameters, unkeyed=("scene.file",),

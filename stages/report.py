@@ -117,7 +117,10 @@ def _floor_plan(volume: "UncertaintyVolume", height: float) -> "rd.FloorPlan":
 def _slices(volumes: "dict[int, UncertaintyVolume]", height: float) -> "list[rd.SliceSeries]":
     from active3d_pipe.report.data import SliceSeries
     from active3d_pipe.structures import VOLUMES
+    from active3d_pipe.uncertainty.growth import on_grid
 
+    last = volumes[max(volumes)].grid  # the largest, if they grew
+    volumes = {k: on_grid(v, last) for k, v in volumes.items()}
     return [
         SliceSeries(name, *VOLUMES[name], [(k, v[name][:, :, _level(v, height)]) for k, v in volumes.items()])
         for name in SLICES

@@ -81,7 +81,10 @@ def read_capture(folder: Path) -> dict[str, Any]:
 
 
 def load_rig(inputs: Mapping[NodeId, Path]) -> dict[str, Any]:
-    """What the first capture says of the scene box and the start pose: all that later stages may know of the world."""
+    """What the first capture says of the scene and the camera: all that later stages may know of the world.
+
+    `bounds` [[low], [high]], world, m, is the box to explore; None: it is to be found (`scene.bounds = "auto"`).
+    """
     return read_capture(inputs[NodeId("capture", 0)])["rig"]
 
 
@@ -199,5 +202,4 @@ def load_map(folder: Path, inputs: Mapping[NodeId, Path], config: Any, *, to_tra
         keyframes.append(Keyframe(frame, doc["round"], doc["reason"], doc["delta"], doc["gain"], doc["rho"]))
     names = ("field", "gaussians", "optimiser") if to_train else ("field", "gaussians")
     state = {name: read_tensors(folder / f"{name}.safetensors")[0] for name in names}
-    bounds = np.array(load_rig(inputs)["bounds"])
-    return HybridMap.from_state(bounds[0], bounds[1], config.mapping, state, keyframes)
+    return HybridMap.from_state(config.mapping, state, keyframes)

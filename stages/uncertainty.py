@@ -53,11 +53,13 @@ def _run(context: StageContext) -> None:
     import numpy as np
 
     from active3d_pipe.storage import volumes
+    from active3d_pipe.storage.files import read_json
+    from active3d_pipe.uncertainty.growth import grown_grid, on_grid
     from active3d_pipe.uncertainty.volume import compute_volume, make_grid
 
     config, k = context.config, context.round
-    bounds = np.array(shared.load_rig(context.inputs)["bounds"])
-    grid = make_grid(bounds[0], bounds[1], config.uncertainty)
+    low, high = np.array(read_json(context.input("mapping", k) / "mapping.json")["bounds"])
+    grid = make_grid(low, high, config.uncertainty)
     frames = shared.load_frames(context.input("capture", k))
     start = time.perf_counter()
     hybrid = shared.load_map(context.input("mapping", k), context.inputs, config, to_train=False)
@@ -65,6 +67,9 @@ def _run(context: StageContext) -> None:
     previous, predicted = None, []
     if k > 0:
         previous = volumes.read_volume(context.input("uncertainty", k - 1) / shared.VOLUME_NAME)
+        margin = config.uncertainty.margin_m
+        grid = grown_grid(previous.grid, low - margin, high + margin)
+        previous = on_grid(previous, grid)
         before = shared.load_map(context.input("mapping", k - 1), context.inputs, config, to_train=False)
         ahead = frames[:: config.uncertainty.predict_every]
         predicted = residuals(before, ahead, config.uncertainty.render_stride, context.timings, of_field=True)
@@ -105,6 +110,6 @@ def _write_surface(context: StageContext, hybrid: "HybridMap", volume: "Uncertai
 
 
 STAGE = Stage(
-    name="uncertainty", version=2, config=("uncertainty", "mapping", "export.preview_voxel_m"),
+    name="uncertainty", version=3, config=("uncertainty", "mapping", "export.preview_voxel_m"),
     inputs=_inputs, run=_run, loop=True,
 )

@@ -17,7 +17,8 @@ class PlaneLayout:
     """Where the planes of all levels lie in one table.
 
     Attributes:
-        rows: (P, 6) int64, a row a plane: first node, nodes along a, nodes along b, a, b, level.
+        rows: (P, 8) int64, a row a plane: first node, nodes along a, nodes along b, a, b, level, position of the lowest
+            node along a and b, in nodes from where the box began.
         inv_resolution: (P,) float32, 1/m.
         nodes: number of nodes of the table.
         levels: number of levels.
@@ -29,13 +30,16 @@ class PlaneLayout:
     levels: int
 
     @classmethod
-    def of_box(cls, extent: np.ndarray, resolutions_m: tuple[float, ...]) -> "PlaneLayout":
-        """Three axis-aligned planes a level over a box of `extent` (3,) m."""
+    def of_box(
+        cls, extent: np.ndarray, resolutions_m: tuple[float, ...], below: np.ndarray | float = 0.0
+    ) -> "PlaneLayout":
+        """Three axis-aligned planes a level over a box that reaches `extent` (3,) m above its anchor, `below` under."""
         rows, inv, nodes = [], [], 0
         for level, resolution in enumerate(resolutions_m):
-            n = node_counts(extent, resolution)
+            first = lowest_nodes(below, resolution)
+            n = node_counts(extent, resolution) - first
             for a, b in PLANE_AXES:
-                rows.append((nodes, n[a], n[b], a, b, level))
+                rows.append((nodes, n[a], n[b], a, b, level, first[a], first[b]))
                 inv.append(1 / resolution)
                 nodes += int(n[a] * n[b])
         return cls(np.array(rows, dtype=np.int64), np.array(inv, dtype=np.float32), nodes, len(resolutions_m))
@@ -44,6 +48,38 @@ class PlaneLayout:
 def node_counts(extent: np.ndarray, resolution_m: float) -> np.ndarray:
     """(3,) number of nodes, spaced by `resolution_m`, that cover a box of `extent` m."""
     return np.maximum(np.ceil(np.asarray(extent) / resolution_m - 1e-6).astype(np.int64) + 1, 2)
+
+
+def lowest_nodes(below: np.ndarray | float, resolution_m: float) -> np.ndarray:
+    """(3,) int64 <= 0, position of the lowest node of a box that reaches `below` m under its anchor, in nodes."""
+    return -np.ceil(np.broadcast_to(below, 3) / resolution_m - 1e-6).astype(np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class BlobLayout:
+    """Where the bins of the OneBlob encoding lie; they keep their width and place when the box grows.
+
+    Attributes:
+        low: (3,) float32 lower end of the first bin, world, m.
+        inv_extent: (3,) float32 1/m, one over the length of all bins of an axis.
+        bins: bins of every axis; an axis that grew less has bins beyond its end.
+        first: (3,) int64, bins below those of the initial box.
+    """
+
+    low: np.ndarray
+    inv_extent: np.ndarray
+    bins: int
+    first: np.ndarray
+
+    @classmethod
+    def of_box(cls, anchor: np.ndarray, box: np.ndarray, bins: int) -> "BlobLayout":
+        """`bins` over `anchor` (2, 3), the box at creation, and more of the same width over the present `box`."""
+        width = (anchor[1] - anchor[0]) / bins
+        first = np.maximum(np.ceil((anchor[0] - box[0]) / width - 1e-3), 0).astype(np.int64)
+        more = first + np.maximum(np.ceil((box[1] - anchor[1]) / width - 1e-3), 0).astype(np.int64)
+        total = bins + int(more.max())
+        low = (anchor[0] - first * width).astype(np.float32)
+        return cls(low, (1 / (width * total)).astype(np.float32), total, first)
 
 
 def check_memory(values: int, limit_megabytes: float) -> None:
@@ -87,19 +123,19 @@ class EncodeGrid(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, grid: torch.Tensor, points: np.ndarray, low: np.ndarray, inv_resolution: np.float32
+        ctx: Any, grid: torch.Tensor, points: np.ndarray, low: np.ndarray, first: np.ndarray, inv_resolution: np.float32
     ) -> torch.Tensor:
-        """`grid` (X, Y, Z, channels) float32, `points` (N, 3) float32 world m, `low` (3,) float32."""
-        ctx.points, ctx.low, ctx.inv_resolution, ctx.shape = points, low, inv_resolution, grid.shape
+        """`grid` (X, Y, Z, channels) float32, `points` (N, 3) float32 world m, `low` (3,) float32, `first` (3,)."""
+        ctx.points, ctx.low, ctx.first, ctx.inv_resolution, ctx.shape = points, low, first, inv_resolution, grid.shape
         out = torch.empty((len(points), grid.shape[3]))
-        kernels.grid_forward(points, low, grid.detach().numpy(), inv_resolution, out.numpy(), 0)
+        kernels.grid_forward(points, low, first, grid.detach().numpy(), inv_resolution, out.numpy(), 0)
         return out
 
     @staticmethod
-    def backward(ctx: Any, *d_out: torch.Tensor) -> tuple[torch.Tensor, None, None, None]:
+    def backward(ctx: Any, *d_out: torch.Tensor) -> tuple[torch.Tensor, None, None, None, None]:
         """Gradient of the grid."""
         d_grid = torch.zeros(ctx.shape)
         kernels.grid_backward(
-            ctx.points, ctx.low, ctx.inv_resolution, d_out[0].contiguous().numpy(), 0, d_grid.numpy()
+            ctx.points, ctx.low, ctx.first, ctx.inv_resolution, d_out[0].contiguous().numpy(), 0, d_grid.numpy()
         )
-        return d_grid, None, None, None
+        return d_grid, None, None, None, None

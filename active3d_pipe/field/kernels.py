@@ -2,14 +2,19 @@
 """Encoders of the implicit branch: OneBlob, multi-resolution tri-plane, dense feature grid.
 
 Tables are channel-last, so that one node is one or two cache lines. Nodes sit on the corners of the cells:
-node i of an axis lies at low + i * resolution. Points outside the tables are clamped to their border.
+node i of an axis lies at low + (first + i) * resolution. `low` is where the box of the field once began and never
+moves; `first` is 0 at creation and negative after the box grew downwards, so that a point keeps its cell and its
+fractions, bit by bit. Points outside the tables are clamped to their border.
 
-The plane tables of all levels are one array (nodes, channels). `layout` (P, 6) int64 has one row a plane:
-first node, nodes along axis a, nodes along axis b, axis a, axis b, level. The three planes of a level are summed.
+The plane tables of all levels are one array (nodes, channels). `layout` (P, 8) int64 has one row a plane: first node
+of the table, nodes along axis a, nodes along axis b, axis a, axis b, level, `first` along a and b. The three planes
+of a level are summed.
 
 Backward gives every plane to one task and splits the grid into slabs, so that no two tasks write one node:
 the gradient has the same bits on every run and for every number of threads.
 """
+
+import math
 
 import numpy as np
 from numba import njit, prange
@@ -29,11 +34,11 @@ def _quartic_cdf(u):
 
 
 @njit(inline="always", fastmath=True)
-def _cell(x, inv, n):
-    """Lower node and fraction of coordinate x (m from the table's low corner)."""
-    g = min(max(x * inv, F0), np.float32(n - 1))
-    i = min(np.int64(g), n - 2)
-    return i, g - np.float32(i)
+def _cell(x, inv, first, n):
+    """Lower node and fraction of coordinate x (m from `low`) on an axis of n nodes, the lowest of them `first`."""
+    g = min(max(x * inv, np.float32(first)), np.float32(first + n - 1))
+    i = min(np.int64(math.floor(g)), first + n - 2)
+    return i - first, g - np.float32(i)
 
 
 @njit(parallel=True, fastmath=True, cache=True)
@@ -65,8 +70,8 @@ def planes_forward(points, low, planes, layout, inv_res, out, col):
             for q in range(layout.shape[0]):
                 nb = layout[q, 2]
                 a, b = layout[q, 3], layout[q, 4]
-                i, fa = _cell(points[p, a] - low[a], inv_res[q], layout[q, 1])
-                j, fb = _cell(points[p, b] - low[b], inv_res[q], nb)
+                i, fa = _cell(points[p, a] - low[a], inv_res[q], layout[q, 6], layout[q, 1])
+                j, fb = _cell(points[p, b] - low[b], inv_res[q], layout[q, 7], nb)
                 node = layout[q, 0] + i * nb + j
                 w11 = fa * fb
                 w10 = fa - w11
@@ -82,14 +87,14 @@ def planes_forward(points, low, planes, layout, inv_res, out, col):
 
 
 @njit(parallel=True, fastmath=True, cache=True)
-def grid_forward(points, low, grid, inv_res, out, col):
+def grid_forward(points, low, first, grid, inv_res, out, col):
     """Trilinear features of the dense grid (X, Y, Z, channels) into out[:, col : col + channels]."""
     n = points.shape[0]
     nx, ny, nz, channels = grid.shape
     for p in prange(n):
-        i, fx = _cell(points[p, 0] - low[0], inv_res, nx)
-        j, fy = _cell(points[p, 1] - low[1], inv_res, ny)
-        k, fz = _cell(points[p, 2] - low[2], inv_res, nz)
+        i, fx = _cell(points[p, 0] - low[0], inv_res, first[0], nx)
+        j, fy = _cell(points[p, 1] - low[1], inv_res, first[1], ny)
+        k, fz = _cell(points[p, 2] - low[2], inv_res, first[2], nz)
         for c0 in range(0, channels, 4):
             for c in range(4):
                 out[p, col + c0 + c] = F0
@@ -108,12 +113,12 @@ def grid_forward(points, low, grid, inv_res, out, col):
 @njit(fastmath=True, cache=True)
 def _plane_backward(points, low, layout, inv_res, q, d_out, col, d_planes):
     channels = d_planes.shape[1]
-    first, na, nb, a, b = layout[q, 0], layout[q, 1], layout[q, 2], layout[q, 3], layout[q, 4]
+    start, na, nb, a, b = layout[q, 0], layout[q, 1], layout[q, 2], layout[q, 3], layout[q, 4]
     o = col + layout[q, 5] * channels
     for p in range(points.shape[0]):
-        i, fa = _cell(points[p, a] - low[a], inv_res[q], na)
-        j, fb = _cell(points[p, b] - low[b], inv_res[q], nb)
-        node = first + i * nb + j
+        i, fa = _cell(points[p, a] - low[a], inv_res[q], layout[q, 6], na)
+        j, fb = _cell(points[p, b] - low[b], inv_res[q], layout[q, 7], nb)
+        node = start + i * nb + j
         w11 = fa * fb
         w10 = fa - w11
         w01 = fb - w11
@@ -128,17 +133,17 @@ def _plane_backward(points, low, layout, inv_res, q, d_out, col, d_planes):
 
 
 @njit(fastmath=True, cache=True)
-def _grid_slab_backward(points, low, inv_res, first, last, d_out, col, d_grid):
-    """Adds to the nodes first <= i < last along x only."""
+def _grid_slab_backward(points, low, first, inv_res, start, stop, d_out, col, d_grid):
+    """Adds to the nodes start <= i < stop along x only."""
     nx, ny, nz, channels = d_grid.shape
     for p in range(points.shape[0]):
-        i, fx = _cell(points[p, 0] - low[0], inv_res, nx)
-        if i + 1 < first or i >= last:
+        i, fx = _cell(points[p, 0] - low[0], inv_res, first[0], nx)
+        if i + 1 < start or i >= stop:
             continue
-        j, fy = _cell(points[p, 1] - low[1], inv_res, ny)
-        k, fz = _cell(points[p, 2] - low[2], inv_res, nz)
+        j, fy = _cell(points[p, 1] - low[1], inv_res, first[1], ny)
+        k, fz = _cell(points[p, 2] - low[2], inv_res, first[2], nz)
         for di in range(2):
-            if i + di < first or i + di >= last:
+            if i + di < start or i + di >= stop:
                 continue
             wx = fx if di else F1 - fx
             for dj in range(2):
@@ -159,17 +164,19 @@ def planes_backward(points, low, layout, inv_res, d_out, col, d_planes):
 
 
 @njit(parallel=True, fastmath=True, cache=True)
-def grid_backward(points, low, inv_res, d_out, col, d_grid):
+def grid_backward(points, low, first, inv_res, d_out, col, d_grid):
     """Adds the gradient of `grid_forward` to d_grid; one task a slab along x."""
     nx = d_grid.shape[0]
     for s in prange(GRID_SLABS):
         _grid_slab_backward(
-            points, low, inv_res, s * nx // GRID_SLABS, (s + 1) * nx // GRID_SLABS, d_out, col, d_grid
+            points, low, first, inv_res, s * nx // GRID_SLABS, (s + 1) * nx // GRID_SLABS, d_out, col, d_grid
         )
 
 
 @njit(parallel=True, fastmath=True, cache=True)
-def decode_points(points, low, inv_extent, bins, planes, layout, inv_res, grid, inv_grid, w1, b1, w2, b2, out):
+def decode_points(
+    points, low, blob_low, inv_extent, bins, planes, layout, inv_res, grid_first, grid, inv_grid, w1, b1, w2, b2, out
+):
     """Encoding and a two-layer ReLU decoder in one pass, without gradients.
 
     w1 (3 bins + levels * channels + grid channels, hidden), b1 (hidden,), w2 (outputs, hidden), b2 (outputs,),
@@ -190,8 +197,8 @@ def decode_points(points, low, inv_extent, bins, planes, layout, inv_res, grid, 
             for q in range(layout.shape[0]):
                 nb = layout[q, 2]
                 a, b = layout[q, 3], layout[q, 4]
-                i, fa = _cell(points[p, a] - low[a], inv_res[q], layout[q, 1])
-                j, fb = _cell(points[p, b] - low[b], inv_res[q], nb)
+                i, fa = _cell(points[p, a] - low[a], inv_res[q], layout[q, 6], layout[q, 1])
+                j, fb = _cell(points[p, b] - low[b], inv_res[q], layout[q, 7], nb)
                 node = layout[q, 0] + i * nb + j
                 w11 = fa * fb
                 w10 = fa - w11
@@ -204,9 +211,9 @@ def decode_points(points, low, inv_extent, bins, planes, layout, inv_res, grid, 
                             w00 * planes[node, c0 + c] + w01 * planes[node + 1, c0 + c]
                             + w10 * planes[node + nb, c0 + c] + w11 * planes[node + nb + 1, c0 + c]
                         )
-            i, fx = _cell(points[p, 0] - low[0], inv_grid, nx)
-            j, fy = _cell(points[p, 1] - low[1], inv_grid, ny)
-            m, fz = _cell(points[p, 2] - low[2], inv_grid, nz)
+            i, fx = _cell(points[p, 0] - low[0], inv_grid, grid_first[0], nx)
+            j, fy = _cell(points[p, 1] - low[1], inv_grid, grid_first[1], ny)
+            m, fz = _cell(points[p, 2] - low[2], inv_grid, grid_first[2], nz)
             for di in range(2):
                 wx = fx if di else F1 - fx
                 for dj in range(2):
@@ -219,7 +226,7 @@ def decode_points(points, low, inv_extent, bins, planes, layout, inv_res, grid, 
             for c in range(hidden):
                 h[c] = b1[c]
             for a in range(3):
-                x = (points[p, a] - low[a]) * inv_extent[a]
+                x = (points[p, a] - blob_low[a]) * inv_extent[a]
                 x = min(max(x, F0), F1) * fbins
                 middle = min(np.int64(x), bins - 1)
                 for j in range(max(middle - 1, 0), min(middle + 2, bins)):

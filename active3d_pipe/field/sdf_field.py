@@ -9,7 +9,15 @@ import torch
 from active3d_pipe.errors import ArtifactError, ConfigError
 from active3d_pipe.field import kernels
 from active3d_pipe.field.config import FieldSettings
-from active3d_pipe.field.encoding import EncodeGrid, EncodePlanes, PlaneLayout, check_memory, node_counts
+from active3d_pipe.field.encoding import (
+    BlobLayout,
+    EncodeGrid,
+    EncodePlanes,
+    PlaneLayout,
+    check_memory,
+    lowest_nodes,
+    node_counts,
+)
 from active3d_pipe.structures import VoxelGrid
 
 
@@ -46,26 +54,35 @@ class SdfField(torch.nn.Module):
         low, high: (3,) corners of the box in the world, m. Points outside take the values of its border.
         settings: see `FieldSettings`.
         generator: draws the initial weights.
+        anchor: (2, 3) the box with which the field was created, when it has grown since (`growth.grown_field`): nodes
+            and bins keep their places in it.
     """
 
     def __init__(
-        self, low: np.ndarray, high: np.ndarray, settings: FieldSettings, generator: torch.Generator
+        self, low: np.ndarray, high: np.ndarray, settings: FieldSettings, generator: torch.Generator,
+        anchor: np.ndarray | None = None,
     ) -> None:
         super().__init__()
-        self.low = np.asarray(low, dtype=np.float32)
-        self.high = np.asarray(high, dtype=np.float32)
+        self.box = np.stack([low, high]).astype(np.float64)
+        self.anchor = self.box if anchor is None else np.asarray(anchor, dtype=np.float64)
+        self.low, self.high = self.box.astype(np.float32)
+        self._origin, top = self.anchor.astype(np.float32)
         self.settings = settings
         if self.low.shape != (3,) or not (self.high > self.low).all():
             raise ConfigError(f"field bounds {self.low.tolist()} .. {self.high.tolist()}: expected low < high")
-        extent = self.high - self.low
-        self._inv_extent = (1 / extent).astype(np.float32)
-        self._layout = PlaneLayout.of_box(extent, settings.plane_resolutions_m)
-        self._color_layout = PlaneLayout.of_box(extent, settings.color_plane_resolutions_m)
+        extent, below = self.high - self._origin, np.maximum(self._origin - self.low, 0)
+        self.blob = BlobLayout.of_box(
+            np.stack([self._origin, top]), np.stack([self.low, self.high]), settings.oneblob_bins
+        )
+        self.plane_layout = PlaneLayout.of_box(extent, settings.plane_resolutions_m, below)
+        self.color_layout = PlaneLayout.of_box(extent, settings.color_plane_resolutions_m, below)
         self._inv_grid = np.float32(1 / settings.grid_voxel_m)
-        nodes = node_counts(extent, settings.grid_voxel_m)
+        self.grid_first = lowest_nodes(below, settings.grid_voxel_m)
+        nodes = node_counts(extent, settings.grid_voxel_m) - self.grid_first
         c, g = settings.plane_channels, settings.grid_channels
         check_memory(
-            (self._layout.nodes + self._color_layout.nodes) * c + int(nodes.prod()) * g, settings.max_table_megabytes
+            (self.plane_layout.nodes + self.color_layout.nodes) * c + int(nodes.prod()) * g,
+            settings.max_table_megabytes,
         )
         self.visits = np.zeros(tuple(nodes - 1), dtype=np.uint32)
 
@@ -75,10 +92,10 @@ class SdfField(torch.nn.Module):
         def zeros(*shape: int, value: float = 0.0) -> torch.nn.Parameter:
             return torch.nn.Parameter(torch.full(shape, value))
 
-        bins, hidden = 3 * settings.oneblob_bins, settings.hidden
-        width = self._layout.levels * c + g
-        self.planes = normal(self._layout.nodes, c, std=0.01)
-        self.color_planes = normal(self._color_layout.nodes, c, std=0.01)
+        bins, hidden = 3 * self.blob.bins, settings.hidden
+        width = self.plane_layout.levels * c + g
+        self.planes = normal(self.plane_layout.nodes, c, std=0.01)
+        self.color_planes = normal(self.color_layout.nodes, c, std=0.01)
         self.grid = zeros(*(int(n) for n in nodes), g)
         # First layers of the geometry decoder (columns [:hidden]) and the uncertainty head ([hidden:]).
         self.blob_weight = normal(bins, hidden, std=math.sqrt(2 / 3))
@@ -91,7 +108,7 @@ class SdfField(torch.nn.Module):
         self.sigma_weight = normal(hidden, 1, std=0.1 / math.sqrt(hidden))
         sigma_prior = max(settings.sigma_prior_m - settings.sigma_floor_m, 1e-4) / settings.truncation_m
         self.sigma_bias = zeros(1, value=sigma_prior + math.log(-math.expm1(-sigma_prior)))
-        color_width = settings.geometry_features + self._color_layout.levels * c
+        color_width = settings.geometry_features + self.color_layout.levels * c
         self.color_blob_weight = normal(bins, hidden, std=math.sqrt(2 / 3))
         self.color_feature_weight = normal(color_width, hidden, std=math.sqrt(2 / color_width))
         self.color_hidden_bias = zeros(hidden)
@@ -106,12 +123,13 @@ class SdfField(torch.nn.Module):
     @property
     def visit_grid(self) -> VoxelGrid:
         """The cells that `visits` counts on."""
-        return VoxelGrid(self.low, self.settings.grid_voxel_m, self.visits.shape)
+        size = self.settings.grid_voxel_m
+        return VoxelGrid(self._origin + self.grid_first * size, size, self.visits.shape)
 
     def oneblob(self, points: np.ndarray) -> torch.Tensor:
         """(N, 3 * bins) OneBlob encoding of world points (N, 3) float32."""
-        out = torch.empty((len(points), 3 * self.settings.oneblob_bins))
-        kernels.oneblob(points, self.low, self._inv_extent, self.settings.oneblob_bins, out.numpy())
+        out = torch.empty((len(points), 3 * self.blob.bins))
+        kernels.oneblob(points, self.blob.low, self.blob.inv_extent, self.blob.bins, out.numpy())
         return out
 
     def geometry(self, points: np.ndarray) -> Geometry:
@@ -119,8 +137,8 @@ class SdfField(torch.nn.Module):
         hidden, floor = self.settings.hidden, self.settings.sigma_floor_m / self.truncation_m
         blob = self.oneblob(points)
         features = torch.cat([
-            EncodePlanes.apply(self.planes, points, self.low, self._layout),
-            EncodeGrid.apply(self.grid, points, self.low, self._inv_grid),
+            EncodePlanes.apply(self.planes, points, self._origin, self.plane_layout),
+            EncodeGrid.apply(self.grid, points, self._origin, self.grid_first, self._inv_grid),
         ], dim=1)
         h = torch.addmm(self.bias, features, self.feature_weight)
         h_geometry = torch.relu(torch.addmm(h[:, :hidden], blob, self.blob_weight))
@@ -132,7 +150,7 @@ class SdfField(torch.nn.Module):
 
     def color(self, points: np.ndarray, oneblob: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
         """Differentiable colour (N, 3) in 0..1 of points (N, 3), given their OneBlob and geometry features."""
-        planes = EncodePlanes.apply(self.color_planes, points, self.low, self._color_layout)
+        planes = EncodePlanes.apply(self.color_planes, points, self._origin, self.color_layout)
         h = torch.addmm(self.color_hidden_bias, oneblob, self.color_blob_weight)
         h = torch.addmm(h, torch.cat([features, planes], dim=1), self.color_feature_weight)
         return torch.sigmoid(torch.addmm(self.color_bias, torch.relu(h), self.color_weight))
@@ -159,9 +177,9 @@ class SdfField(torch.nn.Module):
             w2[1, hidden:], b2[1] = w_sigma[:, 0], b_sigma[0]
         out = np.empty((len(points), len(w2)), np.float32)
         kernels.decode_points(
-            points, self.low, self._inv_extent, self.settings.oneblob_bins, self.planes.detach().numpy(),
-            self._layout.rows, self._layout.inv_resolution, self.grid.detach().numpy(), self._inv_grid,
-            w1, np.ascontiguousarray(bias[:columns]), w2, b2, out,
+            points, self._origin, self.blob.low, self.blob.inv_extent, self.blob.bins, self.planes.detach().numpy(),
+            self.plane_layout.rows, self.plane_layout.inv_resolution, self.grid_first, self.grid.detach().numpy(),
+            self._inv_grid, w1, np.ascontiguousarray(bias[:columns]), w2, b2, out,
         )
         return out
 
@@ -208,30 +226,38 @@ class SdfField(torch.nn.Module):
 
     def count_visits(self, points: np.ndarray) -> None:
         """Count training samples (N, 3) in the cells of `visit_grid`; counts saturate."""
-        shape = np.asarray(self.visits.shape)
-        ijk = np.clip(((points - self.low) * self._inv_grid).astype(np.int64), 0, shape - 1)
+        ijk = self._cells(points)
         inside = ((points >= self.low) & (points <= self.high)).all(axis=1)
         flat = np.ravel_multi_index(tuple(ijk[inside].T), self.visits.shape)
         cells, counts = np.unique(flat, return_counts=True)
         visits = self.visits.reshape(-1)
         visits[cells] = np.minimum(visits[cells].astype(np.int64) + counts, 2**31)
 
+    def _cells(self, points: np.ndarray) -> np.ndarray:
+        """(N, 3) int64 cells of `visit_grid`, the nearest ones for points outside."""
+        ijk = np.floor((points - self._origin) * self._inv_grid).astype(np.int64) - self.grid_first
+        return np.clip(ijk, 0, np.asarray(self.visits.shape) - 1)
+
     def visited(self, points: np.ndarray) -> np.ndarray:
         """(N,) bool, whether training samples fell into the cell of each world point (N, 3)."""
-        shape = np.asarray(self.visits.shape)
-        ijk = np.clip(((points - self.low) * self._inv_grid).astype(np.int64), 0, shape - 1)
+        ijk = self._cells(points)
         return self.visits[ijk[:, 0], ijk[:, 1], ijk[:, 2]] > 0
 
     def state(self) -> dict[str, np.ndarray]:
-        """Every parameter and counter as an array (copies); `load_state` restores them exactly."""
+        """Every parameter and counter as an array (copies); `load_state` restores them exactly.
+
+        `boxes` (2, 2, 3) float64 are the boxes at creation and now, world, m.
+        """
         arrays = {name: p.detach().numpy().copy() for name, p in self.named_parameters()}
-        return {**arrays, "visits": self.visits.copy()}
+        return {**arrays, "visits": self.visits.copy(), "boxes": np.stack([self.anchor, self.box])}
 
     def load_state(self, arrays: dict[str, np.ndarray]) -> None:
         """Inverse of `state`; ArtifactError when an array is missing or has another form."""
         expected = self.state()
         for name, old in expected.items():
             new = arrays.get(name)
+            if name == "boxes" and new is not None and not np.array_equal(new, old):
+                raise ArtifactError(f"field state: its box is {new[1].tolist()}, expected {old[1].tolist()}")
             if new is None or new.shape != old.shape or new.dtype != old.dtype:
                 got = "missing" if new is None else f"{new.shape} {new.dtype}"
                 raise ArtifactError(

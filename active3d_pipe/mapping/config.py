@@ -29,6 +29,19 @@ class WindowSettings(Settings):
     replay: float = Field(0.3, ge=0, le=1, description="share of iterations on random older keyframes (E_reg)")
 
 
+class ExtentSettings(Settings):
+    """The box of the map when `scene.bounds` is "auto": found in the depth readings, grown with them."""
+
+    margin_m: float = Field(
+        0.15, gt=0, description="the box reaches at least this far beyond every depth reading, else it grows, m"
+    )
+    chunk_m: float = Field(0.4, gt=0, description="a side of the box moves by multiples of this when it grows, m")
+    max_extent_m: float = Field(40.0, gt=0, description="growth ends at this length of an edge of the box, m")
+    max_volume_m3: float = Field(
+        4000.0, gt=0, description="growth ends at this volume of the box, m3 (about 0.2 MB each at voxels of 0.1 m)"
+    )
+
+
 class MappingSettings(Settings):
     """The hybrid map and its optimisation."""
 
@@ -52,3 +65,4 @@ class MappingSettings(Settings):
     gaussians: GaussianSettings = Field(default_factory=GaussianSettings, description="explicit branch")
     keyframes: KeyframeSettings = Field(default_factory=KeyframeSettings, description="keyframe selection")
     window: WindowSettings = Field(default_factory=WindowSettings, description="viewpoint-space sliding window")
+    extent: ExtentSettings = Field(default_factory=ExtentSettings, description="box of the map of an unknown scene")

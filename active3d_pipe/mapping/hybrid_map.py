@@ -7,6 +7,8 @@ from contextlib import contextmanager
 import numpy as np
 import torch
 
+from active3d_pipe.errors import ArtifactError
+from active3d_pipe.field.growth import grown_field
 from active3d_pipe.field.optimise import FieldOptimiser
 from active3d_pipe.field.sdf_field import SdfField
 from active3d_pipe.gaussians.parameters import GaussianParameters
@@ -73,6 +75,18 @@ class HybridMap:
         gaussians = GaussianParameters.from_model(GaussianModel.empty())
         return cls(field, FieldOptimiser(field, settings.field), gaussians, settings)
 
+    @property
+    def bounds(self) -> np.ndarray:
+        """(2, 3) float64 corners of the map's box, world, m."""
+        margin = np.array([[FIELD_MARGIN_M], [-FIELD_MARGIN_M]])
+        return np.round(self.field.box + margin, 9)
+
+    def grow(self, bounds: np.ndarray, rng: np.random.Generator) -> None:
+        """Extend the box to `bounds` (2, 3), world, m; the map of what is known stays as it is."""
+        generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+        low, high = bounds[0] - FIELD_MARGIN_M, bounds[1] + FIELD_MARGIN_M
+        self.field, self.optimiser = grown_field(self.field, self.optimiser, low, high, generator)
+
     def render(self, camera: Camera, T_world_camera: np.ndarray) -> RenderedView:
         """View of the Gaussians: rgb 0..1, depth m (0 where alpha < 0.5), alpha."""
         return render_view(self.gaussians, camera, T_world_camera, self.settings.gaussians)
@@ -95,11 +109,16 @@ class HybridMap:
 
     @classmethod
     def from_state(
-        cls, low: np.ndarray, high: np.ndarray, settings: MappingSettings, state: dict[str, dict[str, np.ndarray]],
-        keyframes: Sequence[Keyframe],
+        cls, settings: MappingSettings, state: dict[str, dict[str, np.ndarray]], keyframes: Sequence[Keyframe]
     ) -> "HybridMap":
         """Inverse of `state`, exact. Without the table `optimiser` the map can be looked at, not trained further."""
-        hybrid = cls.create(low, high, settings, np.random.default_rng(0))
+        boxes = state["field"].get("boxes")
+        if boxes is None or boxes.shape != (2, 2, 3):
+            raise ArtifactError("map: the field's boxes are missing; it was written by another version, map it again")
+        anchor, box = boxes
+        field = SdfField(box[0], box[1], settings.field, torch.Generator().manual_seed(0), anchor)
+        gaussians = GaussianParameters.from_model(GaussianModel.empty())
+        hybrid = cls(field, FieldOptimiser(field, settings.field), gaussians, settings)
         hybrid.field.load_state(state["field"])
         hybrid.keyframes = list(keyframes)
         if "optimiser" not in state:

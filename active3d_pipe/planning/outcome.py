@@ -71,7 +71,7 @@ def account_terms(
 
     `predicted_imp`, `predicted_exp`: corrected prediction, bits; `raw_imp`, `raw_exp` before the correction;
     `entropy_imp_bits`, `entropy_exp_bits`: totals that the next decision compares with; `account`: running sums;
-    `previous`: prediction and outcome of the decision before, absent when it made none.
+    `voxels` of the grid; `previous`: prediction and outcome of the decision before, absent when it made none.
     """
     entropy = tuple(float(volume[f"entropy_{b}"].sum(dtype=np.float64)) for b in BRANCHES)
     account, outcome = Account(), None
@@ -79,13 +79,16 @@ def account_terms(
     if "account" in before:
         account = Account(tuple(before["account"]["predicted"]), tuple(before["account"]["realised"]))
     if "raw_imp" in before and previous is not None and len(previous.path):
-        realised = tuple(before[f"entropy_{b}_bits"] - e for b, e in zip(BRANCHES, entropy, strict=True))
+        # Where the grid has grown, what is new was unseen before: one bit a voxel in each branch.
+        new = volume.grid.size - before.get("voxels", volume.grid.size)
+        realised = tuple(before[f"entropy_{b}_bits"] + new - e for b, e in zip(BRANCHES, entropy, strict=True))
         account = account.with_outcome((before["raw_imp"], before["raw_exp"]), (realised[0], realised[1]))
         outcome = {f"predicted_{b}": before[f"predicted_{b}"] for b in BRANCHES}
         outcome |= {f"realised_{b}": r for b, r in zip(BRANCHES, realised, strict=True)}
     factors = account.correction(raw)
     terms: dict[str, Any] = {
         "account": {"predicted": list(account.predicted), "realised": list(account.realised)},
+        "voxels": volume.grid.size,
     }
     for b, e, r, f in zip(BRANCHES, entropy, raw, factors, strict=True):
         terms |= {f"entropy_{b}_bits": e, f"raw_{b}": r, f"predicted_{b}": r * f}

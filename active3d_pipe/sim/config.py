@@ -19,8 +19,10 @@ class SceneSettings(Settings):
     unit_scale: Literal["auto"] | Annotated[float, Field(gt=0)] = Field(
         "auto", description="metres per unit of the file; auto: scene.json, else the extent tells"
     )
-    bounds: Literal["auto"] | tuple[Triple, Triple] = Field(
-        "auto", description="lowest and highest corner of the explored volume, world, m"
+    bounds: Literal["scene", "auto"] | tuple[Triple, Triple] = Field(
+        "scene",
+        description="box to explore: scene: that of the scene's mesh; auto: unknown, found in the depth readings and "
+        "grown with them; or its lowest and highest corner, world, m",
     )
     start_position: Triple | None = Field(None, description="camera position at step 0, world, m; default: found")
     start_look_at: Triple | None = Field(None, description="point that the camera looks at at step 0, world, m")

@@ -84,7 +84,7 @@ def load_scene(settings: SceneSettings) -> Scene:
     vertices = (vertices * scale).astype(np.float32)
     placement.check_extent(vertices, where)
 
-    if settings.bounds == "auto":
+    if isinstance(settings.bounds, str):  # "auto" too: simulator and evaluation know the scene, the map does not
         low, high = placement.find_bounds(vertices, soup.faces)
     else:
         low, high = (np.asarray(corner, dtype=np.float64) for corner in settings.bounds)

@@ -28,7 +28,7 @@ def unit(x, n, resolution):
 def reference_planes(table, p, layout, resolutions):
     levels = [torch.zeros((len(p), table.shape[1]), dtype=table.dtype) for _ in range(layout.levels)]
     local = torch.from_numpy(p.astype(np.float64) - LOW).to(table.dtype)
-    for first, na, nb, a, b, level in layout.rows:
+    for first, na, nb, a, b, level in layout.rows[:, :6]:
         plane = table[first : first + na * nb].reshape(1, na, nb, -1).permute(0, 3, 1, 2)
         at = torch.stack([
             unit(local[:, b], nb, resolutions[level]), unit(local[:, a], na, resolutions[level]),
@@ -60,7 +60,7 @@ def test_grid_equals_grid_sample():
     n = node_counts(EXTENT, resolution)
     p = points(500)
     grid = torch.randn(*n, 4, generator=torch.Generator().manual_seed(1), requires_grad=True)
-    out = EncodeGrid.apply(grid, p, LOW, np.float32(1 / resolution))
+    out = EncodeGrid.apply(grid, p, LOW, np.zeros(3, np.int64), np.float32(1 / resolution))
     weight = torch.randn(out.shape, generator=torch.Generator().manual_seed(2))
     (gradient,) = torch.autograd.grad((out * weight).sum(), grid)
     exact = grid.detach().double().requires_grad_()
@@ -121,7 +121,7 @@ def test_backward_has_the_same_bits_for_any_number_of_threads():
             numba.set_num_threads(n)
             d, dg = np.zeros((layout.nodes, 16), np.float32), np.zeros((11, 8, 6, 4), np.float32)
             kernels.planes_backward(p, LOW, layout.rows, layout.inv_resolution, g, 0, d)
-            kernels.grid_backward(p, LOW, np.float32(10), g, 0, dg)
+            kernels.grid_backward(p, LOW, np.zeros(3, np.int64), np.float32(10), g, 0, dg)
             results.append(d.tobytes() + dg.tobytes())
     finally:
         numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)

@@ -105,7 +105,7 @@ def test_resting_primitives_keep_their_bytes_while_others_train() -> None:
 def test_a_map_from_its_state_goes_on_with_the_same_bytes() -> None:
     straight, stopped = grown(1), grown(1)
     state = {t: {n: a.copy() for n, a in arrays.items()} for t, arrays in stopped.state().items()}
-    resumed = HybridMap.from_state(LOW, HIGH, SETTINGS, state, stopped.keyframes)
+    resumed = HybridMap.from_state(SETTINGS, state, stopped.keyframes)
     frames = frames_between(6, 12, 25.0)
     for hybrid in (straight, resumed):
         update_map(hybrid, frames, None, 1, SETTINGS, np.random.default_rng(1), lambda _: None)

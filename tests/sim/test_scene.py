@@ -266,3 +266,11 @@ def test_a_scene_without_ceiling_is_accepted_with_a_warning(tmp_path):
     path.write_bytes(scene.export(file_type="glb"))
     loaded = load(path, up_axis="Z")
     assert any("ceiling" in w for w in loaded.warnings)
+
+
+def test_the_simulator_knows_the_scene_whatever_the_map_is_told(tmp_path):
+    path = tmp_path / "room.ply"
+    trimesh.creation.box(extents=EXTENT).export(path)
+    told, unknown = load(path, up_axis="Z"), load(path, up_axis="Z", bounds="auto")
+    np.testing.assert_array_equal(unknown.bounds_low, told.bounds_low)
+    np.testing.assert_array_equal(unknown.bounds_high, told.bounds_high)
