@@ -17,7 +17,10 @@ class KeyframeSettings(Settings):
     tau_view: float = Field(0.18, ge=0, le=1, description="least viewpoint divergence delta_c from every keyframe")
     tau_info: float = Field(25.0, ge=0, description="least hybrid information gain of a frame, bits")
     tau_rho: float = Field(0.005, ge=0, le=1, description="least share of visible voxels that lie in V_high")
-    tau_high: float = Field(0.15, ge=0, description="uncertainty above which a voxel belongs to V_high, both branches")
+    tau_high: float = Field(0.15, ge=0, description="uncertainty above which a voxel belongs to V_high")
+    high_branches: tuple[Literal["imp", "exp"], ...] = Field(
+        ("imp", "exp"), min_length=1, description="branches whose uncertainty must exceed tau_high in V_high"
+    )
     max_gap: int = Field(8, ge=1, description="a frame that diverges enough is promoted after this many steps anyway")
 
 
