@@ -11,7 +11,7 @@ class FieldSettings(Settings):
     """Encodings, decoders, ray sampling, losses and optimiser of the neural SDF field."""
 
     encoder: Literal["triplane", "hash", "grids", "none"] = Field(
-        "triplane", description="gamma(x): tri-planes (the paper's), a hash grid, dense grids of several levels, nothing"
+        "triplane", description="gamma(x): tri-planes (the paper's), a hash grid, dense grids of some levels, nothing"
     )
     plane_resolutions_m: tuple[float, ...] = Field(
         (0.24, 0.06), min_length=1, description="node spacing of each tri-plane level of the geometry features, m"
@@ -84,6 +84,15 @@ class FieldSettings(Settings):
     def _head_sees_something(self) -> Self:
         if self.encoder == "none" and self.grid_channels == 0:
             raise ValueError(
-                "encoder none and grid_channels 0: expected one of them, the uncertainty head would see nothing of places"
+                "encoder none and grid_channels 0: expected one of them, or the uncertainty head sees nothing of places"
             )
         return self
+
+
+class TsdfSettings(Settings):
+    """TSDF fusion in place of the neural field (`mapping.geometry = "tsdf"`)."""
+
+    voxel_m: float = Field(0.02, gt=0, description="edge of a voxel, m")
+    truncation_m: float = Field(0.08, gt=0, description="distance at which the SDF is truncated, m")
+    sigma_prior_m: float = Field(0.3, gt=0, description="standard deviation of the SDF where nothing was fused, m")
+    max_megabytes: float = Field(2048.0, gt=0, description="refuse to hold more voxels than fit into this, MB")

@@ -39,9 +39,9 @@ class SdfField(torch.nn.Module):
 
     OneBlob(x), the encoder's features gamma(x) (tri-planes, or see `encoders`) and dense grid features V_alpha(x)
     feed the geometry decoder; the uncertainty head (eq. global_uncertainty) sees gamma(x) and V_alpha(x) only, so that
-    what it learned at one place reaches another only through features. Both are one matrix product. The SDF starts at +truncation
-    (free) and sigma at its prior; `visits` counts the training samples that fell into every grid cell, and
-    cells without any are where the prior is held (`losses.prior_loss`).
+    what it learned at one place reaches another only through features. Both are one matrix product. The SDF
+    starts at +truncation (free) and sigma at its prior; `visits` counts the training samples that fell into every grid
+    cell, and cells without any are where the prior is held (`losses.prior_loss`).
 
     Args:
         low, high: (3,) corners of the box in the world, m. Points outside take the values of its border.

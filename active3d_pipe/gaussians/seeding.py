@@ -118,7 +118,7 @@ def _in_front(depth: np.ndarray, rendered: RenderedView, settings: GaussianSetti
     return shown & (depth < rendered.depth - gap)
 
 
-def _pixel_seeds(  # noqa: PLR0913 - the frame's arrays come one by one
+def _pixel_seeds(
     rgb: np.ndarray, depth: np.ndarray, camera: Camera, scene: FrameSurface, wanted: np.ndarray,
     settings: GaussianSettings, max_new: int, rng: np.random.Generator,
 ) -> GaussianModel:
