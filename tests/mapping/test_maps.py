@@ -26,7 +26,9 @@ CAMERA = Camera.from_fov(96, 64, 80.0)
 # What makes a test quick; the presets' own kinds, weights and rules stay.
 QUICK: dict[str, Any] = {
     "refinement_iterations": 20, "refinement_field_iterations": 3, "gaussian_iterations_per_step": 6.0,
-    "field": {"rays": 256, "prior_points": 32, "hash_levels": 8, "hash_finest_m": 0.05},
+    "field": {
+        "rays": 256, "prior_points": 32, "free_samples": 8, "surface_samples": 8, "hash_levels": 8, "hash_finest_m": 0.05,
+    },
     "tsdf": {"voxel_m": 0.04, "truncation_m": 0.1}, "gaussians": {"seed_stride": 1},
 }
 
@@ -36,7 +38,7 @@ def settings_of(name: str) -> MappingSettings:
     for key, value in QUICK.items():
         document[key] = {**document.get(key, {}), **value} if isinstance(value, dict) else value
     if name in SURFACES[1:]:
-        document["field_iterations_per_step"] = 6.0
+        document["field_iterations_per_step"] = 5.0
     return MappingSettings.model_validate(document)
 
 
@@ -45,7 +47,7 @@ def frames_between(first: int, last: int) -> list:
     out = []
     for i in range(first, last):
         yaw, at = np.radians(25.0 * i), np.array([-0.5, 0.6, 0.9])
-        out.append(render(CAMERA, se3.look_at(at, at + [np.cos(yaw), np.sin(yaw), -0.1]), step=i))
+        out.append(render(CAMERA, se3.look_at(at, at + np.array([np.cos(yaw), np.sin(yaw), -0.1])), step=i))
     return out
 
 
