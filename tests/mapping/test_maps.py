@@ -27,7 +27,8 @@ CAMERA = Camera.from_fov(96, 64, 80.0)
 QUICK: dict[str, Any] = {
     "refinement_iterations": 20, "refinement_field_iterations": 3, "gaussian_iterations_per_step": 6.0,
     "field": {
-        "rays": 256, "prior_points": 32, "free_samples": 8, "surface_samples": 8, "hash_levels": 8, "hash_finest_m": 0.05,
+        "rays": 256, "prior_points": 32, "free_samples": 8, "surface_samples": 8, "hash_levels": 8,
+        "hash_finest_m": 0.05,
     },
     "tsdf": {"voxel_m": 0.04, "truncation_m": 0.1}, "gaussians": {"seed_stride": 1},
 }
