@@ -1,10 +1,13 @@
 """Replay the logged frames of a run through the mapper under several settings, and compare the maps.
 
-    python benchmarks/mapping.py RUN [--variant NAME key=value ...]... [--rounds N] [--views N] [--refine]
+    python benchmarks/mapping.py RUN [--variant NAME [FILE.toml] key=value ...]... [--rounds N] [--views N] [--refine]
+        [--mesh] [--png DIR]
 
 The frames, rounds and keyframes are those of the run (its last map says which frames were keyframes), so that the
-variants see the same data. Settings are paths below `mapping`, as in `gaussian_iterations_per_step=1`. The scene file
-of the run must be there: held-out views are rendered from it. Prints a Markdown table.
+variants see the same data; a variant whose keyframe policy is `every_n` chooses its own. Settings are paths below
+`mapping`, as in `gaussian_iterations_per_step=1`; a file (configs/maps/*.toml) gives its table `mapping`. The scene
+file of the run must be there: held-out views are rendered from it. `--mesh` adds the geometry of the mesh that export
+would write, `--png` pictures of two held-out views and a captured one. Prints a Markdown table.
 """
 
 import argparse
@@ -17,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from active3d_pipe.evaluation.geometry_metrics import prepare_truth
 from active3d_pipe.evaluation.image_metrics import psnr, ssim
 from active3d_pipe.mapping import branches, update
 from active3d_pipe.mapping.config import MappingSettings
@@ -24,14 +28,19 @@ from active3d_pipe.mapping.hybrid_map import HybridMap
 from active3d_pipe.mapping.keyframes import Keyframe
 from active3d_pipe.mapping.refine import refine
 from active3d_pipe.pipeline.config import Config, load_run_config
-from active3d_pipe.sim.observable import held_out_poses
+from active3d_pipe.pipeline.layers import read_toml
+from active3d_pipe.sim.observable import held_out_poses, observable_points
+from active3d_pipe.structures import TriangleMesh
 from stages import shared
 
 
 def settings_of(pairs: list[str]) -> MappingSettings:
-    """Mapping settings with the given `a.b=value` changes."""
+    """Mapping settings with the given `a.b=value` changes, or those of a file."""
     document: dict[str, Any] = {}
     for pair in pairs:
+        if pair.endswith(".toml"):
+            document |= read_toml(Path(pair)).get("mapping", {})
+            continue
         path, _, text = pair.partition("=")
         *parents, leaf = path.split(".")
         table = document
@@ -86,6 +95,35 @@ def quality(hybrid: HybridMap, views: list) -> tuple[float, float]:
     return tuple(np.mean(scores, axis=0))
 
 
+def geometry(hybrid: HybridMap, frames: list, config: Config, truth: Any) -> str:
+    """Accuracy (cm), completion (cm, what is observable), completion ratio (%, observable), MAD (cm) of the mesh."""
+    from active3d_pipe.evaluation.culling import SeenBy
+    from active3d_pipe.evaluation.evaluate import evaluate_geometry
+    from active3d_pipe.export.final_mesh import final_mesh
+
+    mesh = final_mesh(hybrid.field, frames, config.export.mesh)
+    seen_by = SeenBy(frames[0].camera, np.stack([f.T_world_camera for f in frames]), [f.depth for f in frames])
+    found = evaluate_geometry(
+        mesh, truth, config.evaluation, seen_by=seen_by, query_sdf=hybrid.field.query_sdf
+    )
+    return " | ".join([
+        f"{found['accuracy_cm_surface']:.2f}", f"{found['completion_cm_surface_observable']:.2f}",
+        f"{100 * found['completion_ratio_surface_observable']:.1f}", f"{found['mad_cm']:.2f}",
+    ])
+
+
+def save_views(path: Path, hybrid: HybridMap, views: list) -> None:
+    """Observed and rendered views side by side, one below the other."""
+    from PIL import Image
+
+    rows = []
+    for frame in views:
+        shown = np.clip(hybrid.render(frame.camera, frame.T_world_camera).rgb, 0, 1)
+        rows.append(np.concatenate([frame.rgb, (shown * 255 + 0.5).astype(np.uint8)], axis=1))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.concatenate(rows)).save(path)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
@@ -94,6 +132,8 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=40)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--refine", action="store_true", help="also refine over all frames, as export does")
+    parser.add_argument("--mesh", action="store_true", help="also judge the mesh")
+    parser.add_argument("--png", type=Path, help="folder for pictures of each variant")
     given = parser.parse_args()
     config = load_run_config(given.run / "run.toml", Config)
     data = load(given.run, given.rounds)
@@ -106,25 +146,43 @@ def main() -> None:
     seen = shared.spread(everything, given.views)
     steps = len(everything)
     print(f"{given.run.name}: {steps} frames in {len(data.frames)} rounds, {len(views)} held-out views", flush=True)
-    print("| variant | held-out dB | SSIM | train dB | Gaussians | ms/step | by module (ms/step) |")
-    print("|---|---|---|---|---|---|---|", flush=True)
+    truth, head, rule = None, "", ""
+    if given.mesh:
+        scene = simulator.scene
+        whole = TriangleMesh(scene.vertices.astype(np.float32), scene.faces.astype(np.int32))
+
+        def observable(points: np.ndarray) -> np.ndarray:
+            return observable_points(simulator, points, np.random.default_rng(config.evaluation.seed))
+
+        truth = prepare_truth(whole, config.evaluation, observable)
+        head, rule = "| accuracy cm | completion cm | C.R. % | MAD cm ", "|---|---|---|---"
+    print(f"| variant | held-out dB | SSIM | train dB | Gaussians {head}| ms/step | by module (ms/step) |")
+    print(f"|---|---|---|---|---{rule}|---|---|", flush=True)
     for name, *pairs in given.variant or [["defaults"]]:
         settings = settings_of(pairs)
         hybrid, seconds = replay(data, settings, given.seed)
-        tell(name, hybrid, views, seen, seconds, steps)
+        found = geometry(hybrid, everything, config, truth) if given.mesh and not given.refine else ""
+        tell(name, hybrid, views, seen, seconds, steps, found or " | ".join("-" * (4 if given.mesh else 0)))
         if given.refine:
             start = time.perf_counter()
             report = refine(hybrid, everything, np.random.default_rng(given.seed), lambda _: None)
-            tell(f"{name}, refined {time.perf_counter() - start:.0f} s", hybrid, views, seen, report.seconds, steps)
+            took = time.perf_counter() - start
+            found = geometry(hybrid, everything, config, truth) if given.mesh else ""
+            tell(f"{name}, refined {took:.0f} s", hybrid, views, seen, report.seconds, steps, found)
+        if given.png:
+            save_views(given.png / f"{name}.png", hybrid, [views[0], views[1], seen[len(seen) // 2]])
 
 
-def tell(name: str, hybrid: HybridMap, views: list, seen: list, seconds: dict[str, float], steps: int) -> None:
+def tell(
+    name: str, hybrid: HybridMap, views: list, seen: list, seconds: dict[str, float], steps: int, geometry: str
+) -> None:
     """Print one row."""
     held, similarity = quality(hybrid, views)
     train, _ = quality(hybrid, seen)
     modules = ", ".join(f"{n} {1000 * s / steps:.0f}" for n, s in sorted(seconds.items(), key=lambda x: -x[1]))
     total = 1000 * sum(seconds.values()) / steps
-    cells = (f"{held:.2f}", f"{similarity:.3f}", f"{train:.2f}", str(len(hybrid.gaussians)), f"{total:.0f}", modules)
+    cells = (f"{held:.2f}", f"{similarity:.3f}", f"{train:.2f}", str(len(hybrid.gaussians)))
+    cells += (*([geometry] if geometry else []), f"{total:.0f}", modules)
     print("| " + " | ".join((name, *cells)) + " |", flush=True)
 
 

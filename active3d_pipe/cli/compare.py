@@ -15,7 +15,7 @@ from active3d_pipe.cli import console, session
 if TYPE_CHECKING:
     from active3d_pipe.pipeline.sweep import Cell, Spec, Sweep
 
-FOLDERS = ("ablations", "baselines")
+FOLDERS = ("ablations", "baselines", "maps")
 
 
 def compare(
@@ -63,7 +63,7 @@ def compare(
 
 
 def variant_settings(name: str) -> Mapping[str, Any]:
-    """The settings that a variant's name stands for: `final`, a TOML file, an ablation, a baseline, or a policy."""
+    """What a variant's name stands for: `final`, a TOML file, an ablation, a baseline, a map, or a policy."""
     from importlib.resources import files as package_files
 
     from active3d_pipe.errors import ConfigError
@@ -84,7 +84,7 @@ def variant_settings(name: str) -> Mapping[str, Any]:
     try:
         return {"planning": {"policy": check_name(name)}}
     except ValueError as error:
-        raise ConfigError(f"variant {name!r} is no TOML file, ablation or baseline, and {error}") from None
+        raise ConfigError(f"variant {name!r} is no TOML file, ablation, baseline or map, and {error}") from None
 
 
 def _spec(

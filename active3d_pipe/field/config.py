@@ -1,6 +1,8 @@
 """Knobs of the implicit branch."""
 
-from pydantic import Field, field_validator
+from typing import Literal, Self
+
+from pydantic import Field, field_validator, model_validator
 
 from active3d_pipe.structures import Settings
 
@@ -8,6 +10,9 @@ from active3d_pipe.structures import Settings
 class FieldSettings(Settings):
     """Encodings, decoders, ray sampling, losses and optimiser of the neural SDF field."""
 
+    encoder: Literal["triplane", "hash", "grids", "none"] = Field(
+        "triplane", description="gamma(x): tri-planes (the paper's), a hash grid, dense grids of some levels, nothing"
+    )
     plane_resolutions_m: tuple[float, ...] = Field(
         (0.24, 0.06), min_length=1, description="node spacing of each tri-plane level of the geometry features, m"
     )
@@ -15,8 +20,20 @@ class FieldSettings(Settings):
         (0.24, 0.06), min_length=1, description="node spacing of each tri-plane level of the colour features, m"
     )
     plane_channels: int = Field(16, gt=0, multiple_of=8, description="features of a plane node")
-    grid_voxel_m: float = Field(0.1, gt=0, description="node spacing of the dense feature grid, m")
-    grid_channels: int = Field(4, gt=0, multiple_of=4, description="features of a grid node")
+    hash_levels: int = Field(16, ge=1, le=32, description="encoder hash: levels")
+    hash_features: int = Field(2, ge=1, description="encoder hash: features of an entry")
+    hash_log2_size: int = Field(16, ge=4, le=24, description="encoder hash: binary logarithm of the entries of a level")
+    hash_coarsest_cells: int = Field(16, ge=1, description="encoder hash: cells along the longest side, coarsest level")
+    hash_finest_m: float = Field(0.02, gt=0, description="encoder hash: cell of the finest level, m")
+    level_resolutions_m: tuple[float, ...] = Field(
+        (0.32, 0.16), min_length=1, description="encoder grids: node spacing of each level of the geometry, m"
+    )
+    color_level_resolutions_m: tuple[float, ...] = Field(
+        (0.16,), min_length=1, description="encoder grids: node spacing of each level of the colour, m"
+    )
+    level_channels: int = Field(32, gt=0, multiple_of=4, description="encoder grids: features of a node")
+    grid_voxel_m: float = Field(0.1, gt=0, description="node spacing of the dense feature grid V_alpha, m")
+    grid_channels: int = Field(4, ge=0, multiple_of=4, description="features of a node of V_alpha; 0: there is none")
     oneblob_bins: int = Field(16, ge=2, description="bins per axis of the OneBlob encoding")
     hidden: int = Field(32, gt=0, multiple_of=8, description="width of the hidden layer of every decoder")
     geometry_features: int = Field(15, gt=0, description="features that the geometry decoder hands to the colour one")
@@ -54,9 +71,28 @@ class FieldSettings(Settings):
     weight_smoothness: float = Field(0.001, ge=0, description="weight of the smoothness loss, in truncation units")
     smoothness_step_m: float = Field(0.05, gt=0, description="distance of the point pairs of the smoothness loss, m")
 
-    @field_validator("plane_resolutions_m", "color_plane_resolutions_m")
+    @field_validator(
+        "plane_resolutions_m", "color_plane_resolutions_m", "level_resolutions_m", "color_level_resolutions_m"
+    )
     @classmethod
     def _positive(cls, value: tuple[float, ...]) -> tuple[float, ...]:
         if min(value) <= 0:
-            raise ValueError("every plane resolution must be positive")
+            raise ValueError("every resolution must be positive")
         return value
+
+    @model_validator(mode="after")
+    def _head_sees_something(self) -> Self:
+        if self.encoder == "none" and self.grid_channels == 0:
+            raise ValueError(
+                "encoder none and grid_channels 0: expected one of them, or the uncertainty head sees nothing of places"
+            )
+        return self
+
+
+class TsdfSettings(Settings):
+    """TSDF fusion in place of the neural field (`mapping.geometry = "tsdf"`)."""
+
+    voxel_m: float = Field(0.02, gt=0, description="edge of a voxel, m")
+    truncation_m: float = Field(0.08, gt=0, description="distance at which the SDF is truncated, m")
+    sigma_prior_m: float = Field(0.3, gt=0, description="standard deviation of the SDF where nothing was fused, m")
+    max_megabytes: float = Field(2048.0, gt=0, description="refuse to hold more voxels than fit into this, MB")

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from active3d_pipe.errors import ConfigError
-from active3d_pipe.field import kernels
+from active3d_pipe.field import kernels, kernels_hash
 
 PLANE_AXES = ((0, 1), (0, 2), (1, 2))
 
@@ -43,6 +43,45 @@ class PlaneLayout:
                 inv.append(1 / resolution)
                 nodes += int(n[a] * n[b])
         return cls(np.array(rows, dtype=np.int64), np.array(inv, dtype=np.float32), nodes, len(resolutions_m))
+
+
+@dataclass(frozen=True, eq=False)
+class HashLayout:
+    """Where the levels of a hash grid lie in one table.
+
+    Attributes:
+        rows: (L, 3) int64, a row a level: first entry, entries, nodes along an axis (0: the level is hashed).
+        inv_resolution: (L,) float32, 1/m.
+        last: (L,) float32, index of the last node along an axis.
+        nodes: entries of the table.
+    """
+
+    rows: np.ndarray
+    inv_resolution: np.ndarray
+    last: np.ndarray
+    nodes: int
+
+    @classmethod
+    def of_box(
+        cls, extent: np.ndarray, levels: int, coarsest_cells: int, finest_m: float, log2_size: int
+    ) -> "HashLayout":
+        """Levels over the cube on the longest side of a box of `extent` (3,) m.
+
+        The coarsest has `coarsest_cells` cells along a side, the finest cells of about `finest_m`, those between
+        follow in geometric progression. A level of more than 2^log2_size nodes is hashed into that many entries.
+        """
+        side = float(np.max(extent))
+        finest = max(side / finest_m, coarsest_cells)
+        growth = (finest / coarsest_cells) ** (1 / max(levels - 1, 1))
+        cells = [int(np.ceil(coarsest_cells * growth**level - 1e-6)) for level in range(levels)]
+        rows, nodes = [], 0
+        for n in cells:
+            direct = (n + 1) ** 3 <= 2**log2_size
+            size = (n + 1) ** 3 if direct else 2**log2_size
+            rows.append((nodes, size, n + 1 if direct else 0))
+            nodes += size
+        counts = np.array(cells, np.float32)
+        return cls(np.array(rows, np.int64), counts / np.float32(side), counts, nodes)
 
 
 def node_counts(extent: np.ndarray, resolution_m: float) -> np.ndarray:
@@ -88,7 +127,7 @@ def check_memory(values: int, limit_megabytes: float) -> None:
     if megabytes > limit_megabytes:
         raise ConfigError(
             f"field: feature tables need {megabytes:.0f} MB, more than field.max_table_megabytes={limit_megabytes:g}; "
-            "coarser field.grid_voxel_m or field.plane_resolutions_m, or smaller bounds, need less"
+            "coarser resolutions of grid and encoder (mapping.field), or smaller bounds, need less"
         )
 
 
@@ -139,3 +178,30 @@ class EncodeGrid(torch.autograd.Function):
             ctx.points, ctx.low, ctx.first, ctx.inv_resolution, d_out[0].contiguous().numpy(), 0, d_grid.numpy()
         )
         return d_grid, None, None, None, None
+
+
+class EncodeHash(torch.autograd.Function):
+    """Hash-grid features (N, levels * channels) of points (N, 3); gradient to the table only."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, table: torch.Tensor, points: np.ndarray, low: np.ndarray, layout: HashLayout
+    ) -> torch.Tensor:
+        """`table` (nodes, channels) float32, `points` (N, 3) float32 world m, `low` (3,) float32."""
+        ctx.points, ctx.low, ctx.layout, ctx.shape = points, low, layout, table.shape
+        out = torch.empty((len(points), len(layout.rows) * table.shape[1]))
+        kernels_hash.hash_forward(
+            points, low, table.detach().numpy(), layout.rows, layout.inv_resolution, layout.last, out.numpy()
+        )
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *d_out: torch.Tensor) -> tuple[torch.Tensor, None, None, None]:
+        """Gradient of the table."""
+        d_table = torch.zeros(ctx.shape)
+        layout = ctx.layout
+        kernels_hash.hash_backward(
+            ctx.points, ctx.low, layout.rows, layout.inv_resolution, layout.last, d_out[0].contiguous().numpy(),
+            d_table.numpy(),
+        )
+        return d_table, None, None, None

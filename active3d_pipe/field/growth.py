@@ -3,6 +3,8 @@
 import numpy as np
 import torch
 
+from active3d_pipe.errors import ConfigError
+from active3d_pipe.field.encoders import DenseGrids, Encoder, Planes
 from active3d_pipe.field.encoding import BlobLayout, PlaneLayout
 from active3d_pipe.field.optimise import FieldOptimiser
 from active3d_pipe.field.sdf_field import SdfField
@@ -20,7 +22,15 @@ def grown_field(
         field, optimiser: as trained so far; left as they are.
         low, high: (3,) corners of the new box, world, m; what they leave out of the old one is kept.
         generator: draws the new nodes.
+
+    Raises:
+        ConfigError: the field's encoder is a hash grid, whose tables are bound to their box.
     """
+    if not isinstance(field.encoder, Planes | DenseGrids | None):
+        raise ConfigError(
+            f"mapping.field.encoder={field.settings.encoder}: its box cannot grow; "
+            'expected triplane, grids or none with scene.bounds="auto", or give scene.bounds'
+        )
     box = np.stack([np.minimum(low, field.box[0]), np.maximum(high, field.box[1])])
     new = SdfField(box[0], box[1], field.settings, generator, field.anchor)
     with torch.no_grad():
@@ -50,13 +60,25 @@ def _carry(name: str, old: SdfField, new: SdfField, source: np.ndarray, target: 
     if name == "grid":
         target[_window(old.grid_first - new.grid_first, source.shape[:3])] = source
     elif name == "planes":
-        _carry_planes(old.plane_layout, new.plane_layout, source, target)
+        _carry_nodes(old.encoder, new.encoder, source, target)
     elif name == "color_planes":
-        _carry_planes(old.color_layout, new.color_layout, source, target)
+        _carry_nodes(old.color_encoder, new.color_encoder, source, target)
     elif name.endswith("blob_weight"):
         _carry_bins(old.blob, new.blob, source, target)
     else:
         target[...] = source
+
+
+def _carry_nodes(old: Encoder | None, new: Encoder | None, source: np.ndarray, target: np.ndarray) -> None:
+    if isinstance(old, Planes) and isinstance(new, Planes):
+        _carry_planes(old.layout, new.layout, source, target)
+    elif isinstance(old, DenseGrids) and isinstance(new, DenseGrids):
+        at = to = 0
+        for level, ((nodes, _), (room, _)) in enumerate(zip(old.levels, new.levels, strict=True)):
+            grid = target[to : to + new.sizes[level]].reshape(*room, -1)  # a view
+            part = source[at : at + old.sizes[level]].reshape(*nodes, -1)
+            grid[_window(old.first[level] - new.first[level], nodes)] = part
+            at, to = at + old.sizes[level], to + new.sizes[level]
 
 
 def _carry_planes(old: PlaneLayout, new: PlaneLayout, source: np.ndarray, target: np.ndarray) -> None:

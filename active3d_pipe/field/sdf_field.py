@@ -9,15 +9,8 @@ import torch
 from active3d_pipe.errors import ArtifactError, ConfigError
 from active3d_pipe.field import kernels
 from active3d_pipe.field.config import FieldSettings
-from active3d_pipe.field.encoding import (
-    BlobLayout,
-    EncodeGrid,
-    EncodePlanes,
-    PlaneLayout,
-    check_memory,
-    lowest_nodes,
-    node_counts,
-)
+from active3d_pipe.field.encoders import Planes, make_encoders
+from active3d_pipe.field.encoding import BlobLayout, EncodeGrid, check_memory, lowest_nodes, node_counts
 from active3d_pipe.structures import VoxelGrid
 
 
@@ -44,11 +37,11 @@ class Geometry(NamedTuple):
 class SdfField(torch.nn.Module):
     """SDF, its standard deviation and colour over a box.
 
-    OneBlob(x), tri-plane features gamma(x) and dense grid features V_alpha(x) feed the geometry decoder; the
-    uncertainty head (eq. global_uncertainty) sees gamma(x) and V_alpha(x) only, so that what it learned at one
-    place reaches another only through features. Both are one matrix product. The SDF starts at +truncation
-    (free) and sigma at its prior; `visits` counts the training samples that fell into every grid cell, and
-    cells without any are where the prior is held (`losses.prior_loss`).
+    OneBlob(x), the encoder's features gamma(x) (tri-planes, or see `encoders`) and dense grid features V_alpha(x)
+    feed the geometry decoder; the uncertainty head (eq. global_uncertainty) sees gamma(x) and V_alpha(x) only, so that
+    what it learned at one place reaches another only through features. Both are one matrix product. The SDF
+    starts at +truncation (free) and sigma at its prior; `visits` counts the training samples that fell into every grid
+    cell, and cells without any are where the prior is held (`losses.prior_loss`).
 
     Args:
         low, high: (3,) corners of the box in the world, m. Points outside take the values of its border.
@@ -74,16 +67,13 @@ class SdfField(torch.nn.Module):
         self.blob = BlobLayout.of_box(
             np.stack([self._origin, top]), np.stack([self.low, self.high]), settings.oneblob_bins
         )
-        self.plane_layout = PlaneLayout.of_box(extent, settings.plane_resolutions_m, below)
-        self.color_layout = PlaneLayout.of_box(extent, settings.color_plane_resolutions_m, below)
+        self.encoder, self.color_encoder = make_encoders(self._origin, extent, settings, below)
         self._inv_grid = np.float32(1 / settings.grid_voxel_m)
         self.grid_first = lowest_nodes(below, settings.grid_voxel_m)
         nodes = node_counts(extent, settings.grid_voxel_m) - self.grid_first
-        c, g = settings.plane_channels, settings.grid_channels
-        check_memory(
-            (self.plane_layout.nodes + self.color_layout.nodes) * c + int(nodes.prod()) * g,
-            settings.max_table_megabytes,
-        )
+        g = settings.grid_channels
+        encoders = [e for e in (self.encoder, self.color_encoder) if e is not None]
+        check_memory(sum(math.prod(e.shape) for e in encoders) + int(nodes.prod()) * g, settings.max_table_megabytes)
         self.visits = np.zeros(tuple(nodes - 1), dtype=np.uint32)
 
         def normal(*shape: int, std: float) -> torch.nn.Parameter:
@@ -93,10 +83,14 @@ class SdfField(torch.nn.Module):
             return torch.nn.Parameter(torch.full(shape, value))
 
         bins, hidden = 3 * self.blob.bins, settings.hidden
-        width = self.plane_layout.levels * c + g
-        self.planes = normal(self.plane_layout.nodes, c, std=0.01)
-        self.color_planes = normal(self.color_layout.nodes, c, std=0.01)
-        self.grid = zeros(*(int(n) for n in nodes), g)
+        width = (self.encoder.width if self.encoder else 0) + g
+        # The tables are called after the planes, the paper's encoder, whatever they hold.
+        if self.encoder is not None:
+            self.planes = torch.nn.Parameter(self.encoder.initial(generator))
+        if self.color_encoder is not None:
+            self.color_planes = torch.nn.Parameter(self.color_encoder.initial(generator))
+        if g:
+            self.grid = zeros(*(int(n) for n in nodes), g)
         # First layers of the geometry decoder (columns [:hidden]) and the uncertainty head ([hidden:]).
         self.blob_weight = normal(bins, hidden, std=math.sqrt(2 / 3))
         self.feature_weight = normal(width, 2 * hidden, std=math.sqrt(2 / width))
@@ -108,7 +102,7 @@ class SdfField(torch.nn.Module):
         self.sigma_weight = normal(hidden, 1, std=0.1 / math.sqrt(hidden))
         sigma_prior = max(settings.sigma_prior_m - settings.sigma_floor_m, 1e-4) / settings.truncation_m
         self.sigma_bias = zeros(1, value=sigma_prior + math.log(-math.expm1(-sigma_prior)))
-        color_width = settings.geometry_features + self.color_layout.levels * c
+        color_width = settings.geometry_features + (self.color_encoder.width if self.color_encoder else 0)
         self.color_blob_weight = normal(bins, hidden, std=math.sqrt(2 / 3))
         self.color_feature_weight = normal(color_width, hidden, std=math.sqrt(2 / color_width))
         self.color_hidden_bias = zeros(hidden)
@@ -132,33 +126,41 @@ class SdfField(torch.nn.Module):
         kernels.oneblob(points, self.blob.low, self.blob.inv_extent, self.blob.bins, out.numpy())
         return out
 
-    def geometry(self, points: np.ndarray) -> Geometry:
-        """Differentiable geometry and uncertainty at world points (N, 3) float32, truncation units."""
-        hidden, floor = self.settings.hidden, self.settings.sigma_floor_m / self.truncation_m
-        blob = self.oneblob(points)
-        features = torch.cat([
-            EncodePlanes.apply(self.planes, points, self._origin, self.plane_layout),
-            EncodeGrid.apply(self.grid, points, self._origin, self.grid_first, self._inv_grid),
-        ], dim=1)
+    def _heads(self, points: np.ndarray) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Decoded geometry (N, 1 + G), sigma before its softplus (N,), OneBlob: differentiable."""
+        hidden = self.settings.hidden
+        blob, parts = self.oneblob(points), []
+        if self.encoder is not None:
+            parts.append(self.encoder.encode(self.planes, points))
+        if self.settings.grid_channels:
+            parts.append(EncodeGrid.apply(self.grid, points, self._origin, self.grid_first, self._inv_grid))
+        features = torch.cat(parts, dim=1)
         h = torch.addmm(self.bias, features, self.feature_weight)
         h_geometry = torch.relu(torch.addmm(h[:, :hidden], blob, self.blob_weight))
         h_sigma = torch.relu(h[:, hidden:])
         decoded = torch.addmm(self.geometry_bias, h_geometry, self.geometry_weight)
-        raw_sigma = torch.addmm(self.sigma_bias, h_sigma, self.sigma_weight)[:, 0]
-        sigma = torch.nn.functional.softplus(raw_sigma) + floor
+        return decoded, torch.addmm(self.sigma_bias, h_sigma, self.sigma_weight)[:, 0], blob
+
+    def geometry(self, points: np.ndarray) -> Geometry:
+        """Differentiable geometry and uncertainty at world points (N, 3) float32, truncation units."""
+        decoded, raw_sigma, blob = self._heads(points)
+        sigma = torch.nn.functional.softplus(raw_sigma) + self.settings.sigma_floor_m / self.truncation_m
         return Geometry(decoded[:, 0], sigma, decoded[:, 1:], blob)
 
     def color(self, points: np.ndarray, oneblob: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
         """Differentiable colour (N, 3) in 0..1 of points (N, 3), given their OneBlob and geometry features."""
-        planes = EncodePlanes.apply(self.color_planes, points, self._origin, self.color_layout)
+        if self.color_encoder is not None:
+            features = torch.cat([features, self.color_encoder.encode(self.color_planes, points)], dim=1)
         h = torch.addmm(self.color_hidden_bias, oneblob, self.color_blob_weight)
-        h = torch.addmm(h, torch.cat([features, planes], dim=1), self.color_feature_weight)
+        h = torch.addmm(h, features, self.color_feature_weight)
         return torch.sigmoid(torch.addmm(self.color_bias, torch.relu(h), self.color_weight))
 
     def _decode(self, points: np.ndarray, with_sigma: bool) -> np.ndarray:
-        """(N, 1 or 2) raw SDF and sigma before its softplus, by the fused kernel."""
-        hidden = self.settings.hidden
+        """(N, 1 or 2) raw SDF and sigma before its softplus; tri-planes with V_alpha have a fused kernel for it."""
+        hidden, encoder = self.settings.hidden, self.encoder
         points = _as_points(points)
+        if not isinstance(encoder, Planes) or not self.settings.grid_channels:
+            return self._decode_by_parts(points, with_sigma)
         blob, feature, bias, w_geometry, w_sigma, b_geometry, b_sigma = (
             p.detach().numpy() for p in (
                 self.blob_weight, self.feature_weight, self.bias, self.geometry_weight, self.sigma_weight,
@@ -178,9 +180,19 @@ class SdfField(torch.nn.Module):
         out = np.empty((len(points), len(w2)), np.float32)
         kernels.decode_points(
             points, self._origin, self.blob.low, self.blob.inv_extent, self.blob.bins, self.planes.detach().numpy(),
-            self.plane_layout.rows, self.plane_layout.inv_resolution, self.grid_first, self.grid.detach().numpy(),
+            encoder.layout.rows, encoder.layout.inv_resolution, self.grid_first, self.grid.detach().numpy(),
             self._inv_grid, w1, np.ascontiguousarray(bias[:columns]), w2, b2, out,
         )
+        return out
+
+    def _decode_by_parts(self, points: np.ndarray, with_sigma: bool, batch: int = 65536) -> np.ndarray:
+        out = np.empty((len(points), 2 if with_sigma else 1), np.float32)
+        with torch.no_grad():
+            for i in range(0, len(points), batch):
+                decoded, raw_sigma, _ = self._heads(points[i : i + batch])
+                out[i : i + batch, 0] = decoded[:, 0].numpy()
+                if with_sigma:
+                    out[i : i + batch, 1] = raw_sigma.numpy()
         return out
 
     def query_sdf(self, points: np.ndarray) -> np.ndarray:

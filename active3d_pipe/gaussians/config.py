@@ -1,5 +1,7 @@
 """Knobs of the explicit branch."""
 
+from typing import Literal
+
 from pydantic import Field
 
 from active3d_pipe.structures import Settings
@@ -9,6 +11,12 @@ class GaussianSettings(Settings):
     """Gaussian model: rendering, losses, optimisation, seeding, pruning."""
 
     max_count: int = Field(default=1_000_000, ge=1, description="most primitives the model may hold")
+
+    # Shape
+    isotropic: bool = Field(default=False, description="spheres: one scale for the three axes, no rotation")
+    isotropy_weight: float = Field(
+        default=0.0, ge=0, description="weight of the mean deviation of the scales from their mean, per metre"
+    )
 
     # Rendering
     dilation_px2: float = Field(
@@ -37,6 +45,10 @@ class GaussianSettings(Settings):
     )
 
     # Seeding from a frame
+    seed_method: Literal["octree", "pixels"] = Field(
+        default="octree", description="one disc for every octree leaf, or for every n-th pixel in x and y"
+    )
+    seed_stride: int = Field(default=1, ge=1, description="method pixels: n")
     seed_cell_m: float = Field(
         default=0.048, gt=0, description="edge of the coarsest octree cell that becomes one disc, m"
     )
@@ -48,7 +60,7 @@ class GaussianSettings(Settings):
         default=0.95, gt=0, le=1, description="split a cell when the mean of its unit normals is shorter than this"
     )
     seed_sigma_factor: float = Field(
-        default=0.68, gt=0, description="in-plane sigma of a disc in units of its cell edge"
+        default=0.68, gt=0, description="in-plane sigma of a disc in units of its cell edge, or of the pixel spacing"
     )
     seed_flatness: float = Field(
         default=0.15, gt=0, le=1, description="sigma along the normal relative to in-plane sigma"
@@ -61,6 +73,10 @@ class GaussianSettings(Settings):
         default=0.05, ge=0, description="seed where the observation is nearer than the rendered depth by this, m ..."
     )
     seed_front_ratio: float = Field(default=0.03, ge=0, description="... plus this fraction of the depth")
+    seed_depth_error_factor: float = Field(
+        default=0.0, ge=0,
+        description="above 0, seed where it is nearer by this many medians of the frame's depth error, instead",
+    )
     depth_edge_ratio: float = Field(
         default=0.03, gt=0, description="relative depth step between neighbouring pixels that counts as a depth edge"
     )

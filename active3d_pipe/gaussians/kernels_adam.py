@@ -9,8 +9,8 @@ from numba import njit, prange
 F = np.float32
 ZERO, ONE = F(0), F(1)
 CHUNKS = 64
-# The root mean square gradient below which steps shrink. Visible primitives have 1e-6 to 1e-3; with a smaller value those
-# that are hidden behind others, whose gradients are noise of 1e-9, wander at the full rate.
+# The root mean square gradient below which steps shrink. Visible primitives have 1e-6 to 1e-3; with a smaller value
+# those that are hidden behind others, whose gradients are noise of 1e-9, wander at the full rate.
 EPSILON = F(1e-7)
 # Moments of long unseen primitives decay into denormal numbers, which are slow; they are cut off here.
 TINY = F(1e-30)

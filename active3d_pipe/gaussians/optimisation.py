@@ -4,8 +4,9 @@ import numpy as np
 
 from active3d_pipe.gaussians.config import GaussianSettings
 from active3d_pipe.gaussians.losses import loss_gradient
-from active3d_pipe.gaussians.parameters import GaussianParameters
+from active3d_pipe.gaussians.parameters import LOG_SCALES, GaussianParameters
 from active3d_pipe.gaussians.raster_pass import RasterPass
+from active3d_pipe.gaussians.shape import isotropy_gradient, tie_scales
 from active3d_pipe.structures import Camera
 
 
@@ -46,6 +47,12 @@ def optimise_step(  # noqa: PLR0913 - the frame's arrays come one by one
     grad = raster.backward(out_grad)
     if extra_gradient is not None:
         grad += extra_gradient
+    if settings.isotropy_weight > 0:
+        energy, pull = isotropy_gradient(params.values.numpy(), settings.isotropy_weight)
+        grad[:, LOG_SCALES] += pull
+        terms["loss"] += energy
+    if settings.isotropic:
+        tie_scales(grad)
     params.step(grad, settings, learning_rate_scale, raster.visible() if settings.visible_only else None)
     terms["visible"] = float(raster.num_visible)
     return terms

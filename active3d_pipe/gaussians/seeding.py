@@ -61,8 +61,9 @@ def seed_frame(
     """Discs for the surface of a frame that the model does not show yet.
 
     Pixels count where the rendered alpha is thin, or where the observed surface lies in front of the rendered
-    one. World-aligned octree cells split where colour, normals or a depth edge demand it, not below the pixel
-    footprint; every leaf becomes one disc with the mean position, normal and colour of its pixels.
+    one (`seed_front_*`, or SplaTAM's rule with `seed_depth_error_factor`). World-aligned octree cells split where
+    colour, normals or a depth edge demand it, not below the pixel footprint; every leaf becomes one disc with the mean
+    position, normal and colour of its pixels. With `seed_method` "pixels" every n-th pixel becomes a disc instead.
 
     Args:
         rgb, depth: (H, W, 3) float32 0..1, (H, W) float32 m, 0 = invalid.
@@ -76,11 +77,11 @@ def seed_frame(
     scene = frame_surface(depth, camera, T_world_camera, settings.depth_edge_ratio)
     wanted = depth > 0
     if rendered is not None:
-        gap = settings.seed_front_m + settings.seed_front_ratio * depth
-        in_front = (rendered.depth > 0) & (depth < rendered.depth - gap)
-        wanted &= (rendered.alpha < settings.seed_alpha) | in_front
+        wanted &= (rendered.alpha < settings.seed_alpha) | _in_front(depth, rendered, settings)
     if max_new < 1 or not wanted.any():
         return GaussianModel.empty()
+    if settings.seed_method == "pixels":
+        return _pixel_seeds(rgb, depth, camera, scene, wanted, settings, max_new, rng)
     points = scene.points[wanted]
     keys = np.empty(len(points), np.uint64)
     kernels_seeding.morton_keys(points, settings.seed_cell_m / 2 ** (settings.seed_levels - 1), keys)
@@ -98,7 +99,39 @@ def seed_frame(
     if found > max_new:
         leaves = leaves[np.sort(rng.choice(found, max_new, replace=False))]
     sigma = settings.seed_sigma_factor * np.maximum(leaves[:, 9], leaves[:, 10])
-    return discs(leaves[:, :3], leaves[:, 3:6], leaves[:, 6:9], sigma, settings.seed_flatness, settings.seed_opacity)
+    return discs(leaves[:, :3], leaves[:, 3:6], leaves[:, 6:9], sigma, flatness(settings), settings.seed_opacity)
+
+
+def flatness(settings: GaussianSettings) -> float:
+    """Sigma of a new disc along its normal, relative to that in its plane."""
+    return 1.0 if settings.isotropic else settings.seed_flatness
+
+
+def _in_front(depth: np.ndarray, rendered: RenderedView, settings: GaussianSettings) -> np.ndarray:
+    """(H, W) bool, pixels whose observed surface lies in front of the rendered one."""
+    shown = (rendered.depth > 0) & (depth > 0)
+    if settings.seed_depth_error_factor > 0:
+        error = np.abs(rendered.depth - depth)
+        median = np.median(error[shown]) if shown.any() else 0.0
+        return shown & (rendered.depth > depth) & (error > settings.seed_depth_error_factor * median)
+    gap = settings.seed_front_m + settings.seed_front_ratio * depth
+    return shown & (depth < rendered.depth - gap)
+
+
+def _pixel_seeds(
+    rgb: np.ndarray, depth: np.ndarray, camera: Camera, scene: FrameSurface, wanted: np.ndarray,
+    settings: GaussianSettings, max_new: int, rng: np.random.Generator,
+) -> GaussianModel:
+    """One disc for every `seed_stride`-th wanted pixel in x and y, as wide as the pixel spacing at its depth."""
+    stride = settings.seed_stride
+    lattice = np.zeros_like(wanted)
+    lattice[stride // 2 :: stride, stride // 2 :: stride] = True
+    chosen = np.flatnonzero(wanted & lattice)
+    if len(chosen) > max_new:
+        chosen = np.sort(rng.choice(chosen, max_new, replace=False))
+    sigma = settings.seed_sigma_factor * stride * depth.ravel()[chosen] / camera.fx
+    points, normals, colors = (a.reshape(-1, 3)[chosen] for a in (scene.points, scene.normals, rgb))
+    return discs(points, normals, colors, sigma, flatness(settings), settings.seed_opacity)
 
 
 def error_driven(
@@ -134,7 +167,7 @@ def error_driven(
     sigma = settings.add_sigma_px * scene.footprint.ravel()[candidates]
     return discs(
         scene.points.reshape(-1, 3)[candidates], scene.normals.reshape(-1, 3)[candidates],
-        rgb.reshape(-1, 3)[candidates], sigma, settings.seed_flatness, settings.add_opacity,
+        rgb.reshape(-1, 3)[candidates], sigma, flatness(settings), settings.add_opacity,
     )
 
 

@@ -8,8 +8,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from active3d_pipe.errors import ConfigError
 from active3d_pipe.field.optimise import field_step
 from active3d_pipe.field.rays import sample_rays
+from active3d_pipe.field.sdf_field import SdfField
+from active3d_pipe.field.tsdf import TsdfField
 from active3d_pipe.gaussians.optimisation import optimise_step
 from active3d_pipe.gaussians.pruning import prune_mask
 from active3d_pipe.gaussians.sdf_coupling import sdf_gradient
@@ -71,6 +74,9 @@ def train_field(
 ) -> dict[str, float]:
     """One iteration of the implicit branch on rays of `frames`."""
     settings = hybrid.settings.field
+    if not isinstance(hybrid.field, SdfField) or hybrid.optimiser is None:
+        raise ConfigError("mapping: a TSDF is fused, not trained")
+    hybrid.field_changed()
     with clock.of("ray sampling"):
         batch = sample_rays(frames, settings.rays, rng, weights)
 
@@ -78,6 +84,15 @@ def train_field(
         clock.seconds["ray sampling" if part == "sample" else f"field {part}"] += seconds
 
     return field_step(hybrid.field, hybrid.optimiser, batch, settings, rng, rate, add)
+
+
+def fuse(hybrid: HybridMap, frames: Sequence[Frame], clock: Clock) -> None:
+    """TSDF fusion of `frames`, for maps whose geometry is one."""
+    if not isinstance(hybrid.field, TsdfField):
+        raise ConfigError("mapping: a neural field is trained, not fused")
+    hybrid.field_changed()
+    with clock.of("fusion"):
+        hybrid.field.integrate(frames)
 
 
 def coupling_gradient(hybrid: HybridMap, rng: np.random.Generator, clock: Clock) -> np.ndarray:

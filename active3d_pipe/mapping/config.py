@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from active3d_pipe.field.config import FieldSettings
+from active3d_pipe.field.config import FieldSettings, TsdfSettings
 from active3d_pipe.gaussians.config import GaussianSettings
 from active3d_pipe.structures import Settings
 
@@ -17,7 +17,10 @@ class KeyframeSettings(Settings):
     tau_view: float = Field(0.18, ge=0, le=1, description="least viewpoint divergence delta_c from every keyframe")
     tau_info: float = Field(25.0, ge=0, description="least hybrid information gain of a frame, bits")
     tau_rho: float = Field(0.005, ge=0, le=1, description="least share of visible voxels that lie in V_high")
-    tau_high: float = Field(0.15, ge=0, description="uncertainty above which a voxel belongs to V_high, both branches")
+    tau_high: float = Field(0.15, ge=0, description="uncertainty above which a voxel belongs to V_high")
+    high_branches: tuple[Literal["imp", "exp"], ...] = Field(
+        ("imp", "exp"), min_length=1, description="branches whose uncertainty must exceed tau_high in V_high"
+    )
     max_gap: int = Field(8, ge=1, description="a frame that diverges enough is promoted after this many steps anyway")
 
 
@@ -27,6 +30,9 @@ class WindowSettings(Settings):
     policy: Literal["viewpoint", "temporal"] = Field("viewpoint", description="nearest in viewpoint space or in time")
     size: int = Field(10, ge=1, description="keyframes in the window, m")
     replay: float = Field(0.3, ge=0, le=1, description="share of iterations on random older keyframes (E_reg)")
+    submap_keyframes: int = Field(
+        0, ge=0, description="so many keyframes later the Gaussians rest until the refinement, new ones begin; 0: never"
+    )
 
 
 class ExtentSettings(Settings):
@@ -48,6 +54,10 @@ class MappingSettings(Settings):
     representation: Literal["hybrid", "implicit_only", "explicit_only"] = Field(
         "hybrid", description="hybrid: branches coupled; the others are the variants of the paper's table `converge`"
     )
+    geometry: Literal["neural", "tsdf"] = Field("neural", description="the SDF: neural field, or TSDF fusion")
+    views: Literal["gaussians", "surface"] = Field(
+        "gaussians", description="what renders views; surface: the SDF's zero level and its colour, without Gaussians"
+    )
     gaussian_iterations_per_step: float = Field(0.5, ge=0, description="rasteriser iterations for every captured frame")
     field_iterations_per_step: float = Field(0.25, ge=0, description="field iterations for every captured frame")
     gaussian_iterations_per_keyframe: float = Field(2.5, ge=0, description="and for every keyframe")
@@ -62,6 +72,7 @@ class MappingSettings(Settings):
     refinement_iterations: int = Field(3000, ge=0, description="annealed iterations over all logged frames, in export")
     refinement_field_iterations: int = Field(300, ge=0, description="annealed field iterations, in export")
     field: FieldSettings = Field(default_factory=FieldSettings, description="implicit branch")
+    tsdf: TsdfSettings = Field(default_factory=TsdfSettings, description="implicit branch, with geometry tsdf")
     gaussians: GaussianSettings = Field(default_factory=GaussianSettings, description="explicit branch")
     keyframes: KeyframeSettings = Field(default_factory=KeyframeSettings, description="keyframe selection")
     window: WindowSettings = Field(default_factory=WindowSettings, description="viewpoint-space sliding window")

@@ -98,10 +98,10 @@ class Information:
     A working copy is kept, so that the second of two frames that see the same voxels gains nothing.
     """
 
-    def __init__(self, volume: UncertaintyVolume, tau_high: float) -> None:
+    def __init__(self, volume: UncertaintyVolume, settings: KeyframeSettings) -> None:
         self.grid = volume.grid
         self.entropy = volume["entropy"].astype(np.float64).copy()
-        self.high = (volume["u_exp"] > tau_high) & (volume["u_imp"] > tau_high)
+        self.high = np.all([volume[f"u_{b}"] > settings.tau_high for b in settings.high_branches], axis=0)
 
     def visible(self, frame: Frame) -> np.ndarray:
         """Flat indices of the voxels whose surface the frame observed."""
@@ -133,7 +133,7 @@ def select_keyframes(
     Without a volume (first round) the viewpoint criterion decides alone.
     """
     known = list(keyframes)
-    information = None if volume is None else Information(volume, settings.tau_high)
+    information = None if volume is None else Information(volume, settings)
     for frame in frames:
         if settings.policy == "every_n":
             if not known or frame.step - known[-1].frame.step >= settings.every_n:

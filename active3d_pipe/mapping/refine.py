@@ -29,14 +29,15 @@ def refine(
     Frames are visited in random order, each once before any twice. Held-out views are never seen here.
     """
     settings, clock = hybrid.settings, branches.Clock()
-    for i in range(settings.refinement_field_iterations):
+    for i in range(settings.refinement_field_iterations if settings.geometry == "neural" else 0):
         rate = annealed(i, settings.refinement_field_iterations)
         branches.train_field(hybrid, frames, None, rng, clock, rate)
         if i % 20 == 0:
             progress(f"refining field {i}/{settings.refinement_field_iterations}")
-    total, added, pruned = settings.refinement_iterations, 0, 0
+    total, added, pruned = settings.refinement_iterations if settings.views == "gaussians" else 0, 0, 0
     limit = min(settings.gaussians.max_count, int(len(hybrid.gaussians) * (1 + settings.refinement_growth)))
-    quota = max(1, int((limit - len(hybrid.gaussians)) / max(total * ADD_UNTIL / ADD_EVERY, 1)))
+    growth = limit - len(hybrid.gaussians)
+    quota = max(1, int(growth / max(total * ADD_UNTIL / ADD_EVERY, 1))) if growth > 0 else 0
     coupled = settings.representation == "hybrid"
     order: list[int] = []
     scores: list[float] = []

@@ -54,16 +54,27 @@ def update_map(
     iterations = round_up(
         factor * (settings.field_iterations_per_step * len(frames) + settings.field_iterations_per_keyframe * len(new))
     )
-    field_loss = _field(hybrid, len(new), iterations, rng, clock)
+    field_loss = 0.0
+    if settings.geometry == "tsdf":
+        branches.fuse(hybrid, frames, clock)
+    else:
+        field_loss = _field(hybrid, len(new), iterations, rng, clock)
     progress("field trained")
 
-    seeded = sum(branches.seed(hybrid, k.frame, rng, clock) for k in new)
-    older = draw_older(rng, window, len(hybrid.keyframes), settings.window)
+    seeded, psnr, added, pruned = 0, 0.0, 0, 0
     iterations = round_up(factor * (
         settings.gaussian_iterations_per_step * len(frames) + settings.gaussian_iterations_per_keyframe * len(new)
     ))
-    with hybrid.working_set([hybrid.keyframes[i].frame for i in [*window, *older]]):
-        psnr, added, pruned = _gaussians(hybrid, window, older, len(new), iterations, rng, clock, progress)
+    if settings.window.submap_keyframes and settings.views == "gaussians":
+        window = open_submap(hybrid, len(new))
+        with hybrid.newest_submap():
+            seeded = sum(branches.seed(hybrid, k.frame, rng, clock) for k in new)
+            psnr, added, pruned = _gaussians(hybrid, window, [], len(new), iterations, rng, clock, progress)
+    elif settings.views == "gaussians":
+        seeded = sum(branches.seed(hybrid, k.frame, rng, clock) for k in new)
+        older = draw_older(rng, window, len(hybrid.keyframes), settings.window)
+        with hybrid.working_set([hybrid.keyframes[i].frame for i in [*window, *older]]):
+            psnr, added, pruned = _gaussians(hybrid, window, older, len(new), iterations, rng, clock, progress)
 
     numbers = {
         "keyframes": len(hybrid.keyframes), "new_keyframes": len(new), "window": len(window),
@@ -71,6 +82,14 @@ def update_map(
         "psnr_window": round_number(psnr), "field_loss": round_number(field_loss),
     }
     return UpdateReport(numbers, dict(clock.seconds))
+
+
+def open_submap(hybrid: HybridMap, num_new: int) -> list[int]:
+    """Keyframes of the submap that the new ones belong to; when the last one is full, its primitives come to rest."""
+    first_new = len(hybrid.keyframes) - num_new
+    if num_new and first_new - hybrid.submap[0] >= hybrid.settings.window.submap_keyframes:
+        hybrid.submap = (first_new, len(hybrid.gaussians))
+    return list(range(hybrid.submap[0], len(hybrid.keyframes)))
 
 
 def round_up(x: float) -> int:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from active3d_pipe.errors import InputError
+from active3d_pipe.errors import ConfigError, InputError
 from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.free_space import FreeSpace, build_free_space
 from active3d_pipe.planning.reward import RewardField, build_reward_field
@@ -82,7 +82,9 @@ class MapView:
         state = field.state()
         tables = ("planes", "grid")
         decoder = ("blob_weight", "feature_weight", "bias", "geometry_weight", "geometry_bias")
-        names = decoder if decoder_only else (*decoder, *tables)
+        names = [name for name in (decoder if decoder_only else (*decoder, *tables)) if name in state]
+        if not names:
+            raise ConfigError("planning.policy: it perturbs the weights of a neural field, mapping.geometry has none")
         out = np.empty((samples, len(points_world)), np.float32)
         try:
             for i in range(samples):
