@@ -92,7 +92,7 @@ class CarvedWorld:
         arrays: dict[str, np.ndarray] = {
             "u_imp": unseen, "u_exp": zero, "u_time": zero, "u_final": unseen, "occupancy": p, "entropy_imp": entropy,
             "entropy_exp": entropy, "entropy": entropy, "sdf": sdf, "free_evidence": e.free, "hit_evidence": e.hit,
-            "view_quality": e.quality,
+            "view_quality": e.quality, "cells_passed": e.passed, "cells_hit": e.ended,
         }
         return UncertaintyVolume(self.grid, round_index, {k: a.astype(np.float32) for k, a in arrays.items()})
 

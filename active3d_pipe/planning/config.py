@@ -37,11 +37,10 @@ class PlanningSettings(Settings):
     unknown_free_path_m: float = Field(
         1.0, gt=0, description="mean length of a ray through unknown space before something stops it, m"
     )
-    side_weight: float = Field(
-        0.0, ge=0, description="worth of seeing a surface voxel from a side it was not seen from, against bringing it "
-        "from unseen to seen well enough; 0 = sides do not count"
+    cell_weight: float = Field(
+        2.0, ge=0, description="worth of an eighth of a surface voxel that no ray met though it borders on clear space, "
+        "against an eighth of an unseen voxel"
     )
-    side_views: int = Field(128, ge=1, description="walked poses that the sides seen so far are found from")
     credit_views: int = Field(48, ge=0, description="walked poses searched for looks that brought nothing")
     credit_factor: float = Field(
         0.5, gt=0, le=1, description="what each look that brought nothing leaves of a voxel's expected gain"
