@@ -22,8 +22,8 @@ class PlanningSettings(Settings):
     # Candidates.
     coarse_spacing_m: float = Field(0.5, gt=0, description="spacing of candidate positions over all free space, m")
     fine_spacing_m: float = Field(0.25, gt=0, description="spacing of the positions around the best coarse ones, m")
-    max_positions: int = Field(400, ge=1, description="coarse positions at most; the spacing grows to keep to it")
-    refine_top: int = Field(4, ge=0, description="coarse positions that are refined")
+    max_positions: int = Field(250, ge=1, description="coarse positions at most; the spacing grows to keep to it")
+    refine_top: int = Field(2, ge=0, description="coarse positions that are refined")
     max_targets: int = Field(
         48, ge=0, description="places of value whose best viewpoints are sought among all positions, beside the lattice"
     )
@@ -38,8 +38,8 @@ class PlanningSettings(Settings):
         1.0, gt=0, description="mean length of a ray through unknown space before something stops it, m"
     )
     cell_weight: float = Field(
-        2.0, ge=0, description="worth of an eighth of a surface voxel that no ray met though it borders on clear space, "
-        "against an eighth of an unseen voxel"
+        2.0, ge=0, description="worth of an eighth of a surface voxel that no ray met though it borders on clear "
+        "space, against an eighth of an unseen voxel"
     )
     credit_views: int = Field(48, ge=0, description="walked poses searched for looks that brought nothing")
     credit_factor: float = Field(

@@ -184,7 +184,7 @@ def path_gain(
 
 @njit(fastmath=True, cache=True)
 def mark_seen(origin, R, fan, opaque, clear, shape, voxel_size, max_range, seen, cells):
-    """seen = 1 in every voxel that a view crosses or ends in, cells |= bits of the cells that its rays end in; flat."""
+    """seen = 1 in every voxel that a view meets, cells |= bits of the cells that its rays end in; flat."""
     ids = np.empty(shape[0] + shape[1] + shape[2] + 3, np.int32)
     for r in range(fan.shape[0]):
         n, bit, _, _ = cast(opaque, clear, origin, R, fan[r], voxel_size, max_range, shape, ids)
@@ -196,18 +196,19 @@ def mark_seen(origin, R, fan, opaque, clear, shape, voxel_size, max_range, seen,
 
 @njit(parallel=True, fastmath=True, cache=True)
 def count_looks(
-    origins, rotations, fan, stops, kind, quality, normal, clear, open_bits, shape, voxel_size, max_range, enough,
-    quality_range,
+    origins, rotations, weights, fan, stops, kind, quality, normal, clear, open_bits, shape, voxel_size, max_range,
+    enough, quality_range,
 ):
-    """How many of the past views looked at each voxel, and at open cells of it, in vain; (2, size) int32.
+    """How many of the past views looked at each voxel, and at open cells of it, in vain; (2, size) float32.
 
+    View c counts for weights[c] looks.
     `stops` (flat uint8) holds every voxel in which any ray ever ended. An open voxel on the way there should have
     been settled by the ray: had it returned, it would have passed or ended there. A surface voxel that it meets
     should have come up to the quality of its distance and angle; half of that is demanded. An open cell in which it
     ends should be open no more.
     """
     size, count, chunks = shape[0] * shape[1] * shape[2], origins.shape[0], 2
-    looks = np.zeros((chunks, 2, size), np.int32)
+    looks = np.zeros((chunks, 2, size), np.float32)
     for chunk in prange(chunks):
         stamp, cell_stamp = np.full(size, -1, np.int32), np.full(size, -1, np.int32)
         ids = np.empty(shape[0] + shape[1] + shape[2] + 3, np.int32)
@@ -230,10 +231,10 @@ def count_looks(
                             promised = share > np.float32(0.5) * (ONE - quality[v] / enough)
                         if promised:
                             stamp[v] = c
-                            looks[chunk, 0, v] += 1
+                            looks[chunk, 0, v] += weights[c]
                     if kind[v] == 2 and open_bits[v] & bit and cell_stamp[v] != c:
                         t = distance_to(origins[c], v, shape, voxel_size)
                         if cell_share(t, enough, quality_range) >= ONE:
                             cell_stamp[v] = c
-                            looks[chunk, 1, v] += 1
+                            looks[chunk, 1, v] += weights[c]
     return looks[0] + looks[1]

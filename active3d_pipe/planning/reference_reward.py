@@ -32,7 +32,7 @@ def cell_bit(point: np.ndarray) -> int:
 
 
 def sight(field: RewardField, origin: np.ndarray, direction: np.ndarray) -> tuple[list[tuple[int, int, int]], int]:
-    """Voxels that a ray crosses up to the cell that stops it, without surface voxels that it passes; bit of that cell."""
+    """Voxels that a ray crosses, without surface voxels that it passes, and the bit of the cell that stops it."""
     grid = field.grid
     length = field.max_range_m / grid.voxel_size
     out: list[tuple[int, int, int]] = []

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from active3d_pipe.geometry.voxel_traversal import fan_stride, ray_fan
-from active3d_pipe.information.gain import FREE, OPEN, SURFACE, GainTerms, InformationVolumes, information_volumes
+from active3d_pipe.information.gain import FREE, OPEN, SURFACE, GainTerms, classify, information_volumes
 from active3d_pipe.planning import kernels_distance, kernels_sight
 from active3d_pipe.planning import kernels_reward as kernels
 from active3d_pipe.planning.candidates import Directions
@@ -22,6 +22,8 @@ from active3d_pipe.structures.voxel_grid import VoxelGrid
 
 # Longest jump of a ray through seen free space, voxels.
 LONGEST_SKIP = 12
+# Poses of one place that make one look: steps are short.
+POSES_A_LOOK = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,9 +53,10 @@ class RewardField:
         grid = self.grid
         seen, cells = np.zeros(grid.size, np.uint8), np.zeros(grid.size, np.uint8)
         origin, rotation = (a[0] for a in _in_voxels(grid, T_world_camera[None]))
+        fan = ray_fan(camera, fan_stride(camera, grid.voxel_size, self.max_range_m))[2].astype(np.float32)
         kernels.mark_seen(
-            origin, rotation, ray_fan(camera, fan_stride(camera, grid.voxel_size, self.max_range_m))[2].astype(np.float32),
-            self.opaque, self.clear, grid.shape, np.float32(grid.voxel_size), np.float32(self.max_range_m), seen, cells,
+            origin, rotation, fan, self.opaque, self.clear, grid.shape, np.float32(grid.voxel_size),
+            np.float32(self.max_range_m), seen, cells,
         )
         changed = {name: getattr(self, name).copy() for name in ("value", "surface_value", "gain_imp", "gain_exp")}
         for a in changed.values():
@@ -71,21 +74,20 @@ def build_reward_field(
     grid, information = volume.grid, settings.information
     enough = information.enough_quality(camera.fx)
     reach = min(settings.max_range_m, camera.far)
-    first = information_volumes(volume.arrays, information, enough)
-    kind = first.kind
+    kind = classify(volume.arrays, information)
     through = _transmittance(volume, kind, settings)
     normal = np.zeros((*grid.shape, 3), np.int8)
     kernels_sight.surface_normals(kind, normal)
     clear, open_bits = _cells(volume, kind)
     skip = kernels_distance.distance_transform((kind != FREE).view(np.uint8), LONGEST_SKIP, True).astype(np.uint8)
     opaque = (kind == SURFACE).view(np.uint8).ravel()
-    quality = np.ascontiguousarray(first.quality).ravel()
+    quality = np.ascontiguousarray(volume["view_quality"]).ravel()
     cells = clear.ravel(), open_bits.ravel()
     looks = _looks(volume, kind.ravel(), quality, normal.reshape(-1, 3), cells, walked_poses, camera, settings)
-    credit, cell_credit = np.float32(settings.credit_factor) ** looks.astype(np.float32)
+    credit, cell_credit = np.float32(settings.credit_factor) ** looks
     # An eighth of what an open voxel is worth that may turn out either way, times the weight.
     whole = settings.cell_weight * (information.alpha + information.beta) / 16
-    volumes: InformationVolumes = information_volumes(volume.arrays, information, enough, credit.reshape(grid.shape))
+    volumes = information_volumes(volume.arrays, information, enough, credit.reshape(grid.shape))
     return RewardField(
         grid, information.quality_range_m(camera.fx), enough, reach, kind.ravel(), opaque, skip.ravel(),
         volumes.value.ravel(), through, volumes.surface_value.ravel(), quality, normal.reshape(-1, 3),
@@ -96,8 +98,8 @@ def build_reward_field(
 
 def _in_voxels(grid: VoxelGrid, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Origins (N, 3) in voxel units and rotations (N, 3, 3) of poses (N, 4, 4), as the kernels take them."""
-    origins = (poses[:, :3, 3] - grid.origin) / grid.voxel_size
-    return (np.ascontiguousarray(a, dtype=np.float32) for a in (origins, poses[:, :3, :3]))  # type: ignore[return-value]
+    origins = np.ascontiguousarray((poses[:, :3, 3] - grid.origin) / grid.voxel_size, dtype=np.float32)
+    return origins, np.ascontiguousarray(poses[:, :3, :3], dtype=np.float32)
 
 
 def _cells(volume: UncertaintyVolume, kind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -138,6 +140,25 @@ def spread_poses(poses: np.ndarray, count: int) -> np.ndarray:
     return len(x) - 1 - np.asarray(chosen[:count], dtype=np.int64)
 
 
+def repeated_poses(poses: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of at most `count` poses that stand for all, and float32 how many looks each of them stands for.
+
+    Half of them are well spread, half are those whose surroundings (half a metre, 30 degrees) were taken most often:
+    an agent that keeps looking at what it cannot settle must notice it.
+    """
+    x = np.round(np.concatenate([poses[:, :3, 3] / 0.5, poses[:, :3, 2] / 0.52], axis=1)).astype(np.int64)
+    _, newest, inverse, counts = np.unique(x[::-1], axis=0, return_index=True, return_inverse=True, return_counts=True)
+    place = inverse.ravel()[::-1]
+    crowded = len(x) - 1 - newest[np.lexsort((newest, -counts))[: count - count // 2]]
+    chosen, taken = [], set()
+    for i in [*crowded.tolist(), *spread_poses(poses, count // 2).tolist()]:
+        if place[i] not in taken:
+            taken.add(place[i])
+            chosen.append(i)
+    index = np.asarray(chosen, dtype=np.int64)
+    return index, np.maximum(1, counts[place[index]] / np.float32(POSES_A_LOOK)).astype(np.float32)
+
+
 def _looks(
     volume: UncertaintyVolume,
     kind: np.ndarray,
@@ -151,14 +172,15 @@ def _looks(
     """How many past views promised something of each voxel, of its open cells, that did not come true, (2, size)."""
     grid = volume.grid
     if len(poses) == 0 or settings.credit_views == 0:
-        return np.zeros((2, grid.size), np.int32)
+        return np.zeros((2, grid.size), np.float32)
     reach = min(settings.max_range_m, camera.far)
     # Coarser rays than for scoring: a voxel that only a corner of the fan touches was not really looked at.
     fan = ray_fan(camera, 2 * fan_stride(camera, grid.voxel_size, reach))[2].astype(np.float32)
     stops = ((kind == SURFACE) | (volume["hit_evidence"].ravel() > 0)).view(np.uint8)
-    chosen = poses[spread_poses(poses, settings.credit_views)]
+    chosen, looks = repeated_poses(poses, settings.credit_views)
     return kernels.count_looks(
-        *_in_voxels(grid, chosen), fan, stops, kind, quality, normal, *cells, grid.shape, np.float32(grid.voxel_size), np.float32(reach),
+        *_in_voxels(grid, poses[chosen]), looks, fan, stops, kind, quality, normal, *cells, grid.shape,
+        np.float32(grid.voxel_size), np.float32(reach),
         np.float32(settings.information.enough_quality(camera.fx)),
         np.float32(settings.information.quality_range_m(camera.fx)),
     )

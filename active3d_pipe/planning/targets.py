@@ -28,9 +28,10 @@ def target_positions(
         return np.zeros((0, 3), np.int64)
     enough = settings.information.enough_distance_m
     near = kernels_targets.best_viewpoints(
-        targets.astype(np.int32), cells, places.astype(np.int32), field.opaque, field.clear, field.through, field.normal, grid.shape,
-        np.float32(1.5), np.float32(field.max_range_m / grid.voxel_size), np.float32(enough / grid.voxel_size),
-        space.cost[tuple(places.T)] / np.float32(motion.max_step_m), np.float32(settings.view_steps),
+        targets.astype(np.int32), cells, places.astype(np.int32), field.opaque, field.clear, field.through,
+        field.normal, grid.shape, np.float32(1.5), np.float32(field.max_range_m / grid.voxel_size),
+        np.float32(enough / grid.voxel_size), space.cost[tuple(places.T)] / np.float32(motion.max_step_m),
+        np.float32(settings.view_steps),
     )
     chosen = np.unique(near[near >= 0])
     return places[chosen]

@@ -111,8 +111,8 @@ def test_voxels_looked_at_in_vain_lose_credit(scene):
     world, poses, _ = scene
     volume = world.volume()
     T = se3.pose_from_yaw_pitch(np.array([0.5, 0.5, 1.0]), 3.6, 0.0)
-    looks = np.repeat(T[None], 6, axis=0)
-    looks[:, 0, 3] += np.linspace(0, 0.1, 6)
+    looks = np.repeat(T[None], 8, axis=0)
+    looks[:, 0, 3] += np.linspace(0, 0.1, 8)
     none, many = (
         build_reward_field(volume, np.concatenate([poses, p]), world.camera, SETTINGS) for p in (looks[:0], looks)
     )
