@@ -11,8 +11,8 @@ from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.free_space import FreeSpace
 from active3d_pipe.structures.camera import Camera
 
-# Rays of the sphere: rows of elevation x columns of azimuth, 6 degrees apart.
-NUM_AZIMUTHS, NUM_ELEVATIONS = 60, 30
+# Rays of the sphere: rows of elevation x columns of azimuth, 7.5 degrees apart.
+NUM_AZIMUTHS, NUM_ELEVATIONS = 48, 24
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,8 +22,8 @@ class PlanningSettings(Settings):
     # Candidates.
     coarse_spacing_m: float = Field(0.5, gt=0, description="spacing of candidate positions over all free space, m")
     fine_spacing_m: float = Field(0.25, gt=0, description="spacing of the positions around the best coarse ones, m")
-    max_positions: int = Field(400, ge=1, description="coarse positions at most; the spacing grows to keep to it")
-    refine_top: int = Field(4, ge=0, description="coarse positions that are refined")
+    max_positions: int = Field(250, ge=1, description="coarse positions at most; the spacing grows to keep to it")
+    refine_top: int = Field(2, ge=0, description="coarse positions that are refined")
     max_targets: int = Field(
         48, ge=0, description="places of value whose best viewpoints are sought among all positions, beside the lattice"
     )
@@ -37,11 +37,10 @@ class PlanningSettings(Settings):
     unknown_free_path_m: float = Field(
         1.0, gt=0, description="mean length of a ray through unknown space before something stops it, m"
     )
-    side_weight: float = Field(
-        0.0, ge=0, description="worth of seeing a surface voxel from a side it was not seen from, against bringing it "
-        "from unseen to seen well enough; 0 = sides do not count"
+    cell_weight: float = Field(
+        2.0, ge=0, description="worth of an eighth of a surface voxel that no ray met though it borders on clear "
+        "space, against an eighth of an unseen voxel"
     )
-    side_views: int = Field(128, ge=1, description="walked poses that the sides seen so far are found from")
     credit_views: int = Field(48, ge=0, description="walked poses searched for looks that brought nothing")
     credit_factor: float = Field(
         0.5, gt=0, le=1, description="what each look that brought nothing leaves of a voxel's expected gain"

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from active3d_pipe.errors import InputError
-from active3d_pipe.geometry.voxel_traversal import visible_voxels
 from active3d_pipe.planning.candidates import Directions, view_directions
 from active3d_pipe.planning.choice import Pool, looks_along, reward_density, score, utility_rate, view_cost_steps
 from active3d_pipe.planning.config import PlanningSettings
@@ -199,14 +198,12 @@ def _chain(
 
     A round costs mapping and planning, however short its path. What the views so far will have seen counts no more.
     """
-    settings, grid = task.settings, field.grid
+    settings = task.settings
     open_views = [i for i in range(len(pool.terms)) if i != index]
     added = 0
-    opaque = field.opaque.reshape(grid.shape)
     while len(poses) < settings.min_steps_per_round and open_views and added < LONGEST_CHAIN:
         T = poses[-1]
-        seen = visible_voxels(opaque, grid, T, task.camera, max_range_m=field.max_range_m)
-        field = field.without(seen)
+        field = field.after(T, task.camera)
         here = space.moved_to(pool.voxels[index], settings, task.round_length_m)
         travel = here.cost[tuple(pool.voxels[open_views].T)]
         near = [i for i, c in zip(open_views, travel, strict=True) if c < task.round_length_m]

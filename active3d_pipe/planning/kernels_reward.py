@@ -2,13 +2,14 @@
 """Numba kernels of the reward; `reference_reward.py` is their slow twin.
 
 Points are in voxel units, directions unit vectors / voxel_size, ray parameters in metres (as in
-`geometry.kernels_traversal`). `kind` is 0 seen free, 1 open, 2 surface (`information.gain`).
+`geometry.kernels_traversal`). `kind` is 0 seen free, 1 open, 2 surface (`information.gain`); `clear` and `open_bits`
+are the cells of voxels of `kernels_sight`.
 """
 
 import numpy as np
 from numba import njit, prange
 
-from active3d_pipe.geometry.kernels_traversal import walk_ray
+from active3d_pipe.planning.kernels_sight import cast, cell_bit, cell_share, distance_to, surface_share
 
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
 # A surface seen edge-on would cover a ray's whole solid angle many times over; below this the estimate is capped.
@@ -17,46 +18,17 @@ LEAST_COS = np.float32(0.2)
 LEAST_TRANSMITTANCE = np.float32(0.02)
 
 
-@njit(fastmath=True, cache=True)
-def surface_share(normal, v, dx, dy, dz, voxel_size, t, quality, enough, quality_range):
-    """(share of the improvement to `enough` that this look brings, |cos| of its incidence angle).
-
-    `normal` holds components * 127; where it is zero the surface has no clear side and is taken at 45 degrees.
-    """
-    a, b, c = np.float32(normal[v, 0]), np.float32(normal[v, 1]), np.float32(normal[v, 2])
-    norm = np.sqrt(a * a + b * b + c * c)
-    cos = np.float32(0.7)
-    if norm > np.float32(1.0):
-        cos = min(ONE, abs(a * dx + b * dy + c * dz) * voxel_size / norm)
-    new = cos * min(ONE, quality_range / max(t, np.float32(1e-3)))
-    return max(ZERO, min(new, enough) - quality[v]) / enough, cos
-
-
-@njit(fastmath=True, cache=True, inline="always")
-def heading(dx, dy, dz):
-    """Bit of the octant that a ray heads into: above and below, left and right are told apart."""
-    return np.uint8(1 << ((dx > 0) + 2 * (dy > 0) + 4 * (dz > 0)))
-
-
-@njit(fastmath=True, cache=True, inline="always")
-def side_share(sides, v, dx, dy, dz, t, enough, quality_range, side_weight):
-    """What a look at a surface voxel from an octant that it was not seen from is worth, full up to enough distance."""
-    if sides[v] & heading(dx, dy, dz):
-        return ZERO
-    return side_weight * min(ONE, quality_range / (max(t, np.float32(1e-3)) * enough))
-
-
 @njit(parallel=True, fastmath=True, cache=True)
 def sphere_gain(
-    positions, directions, solid_angles, kind, skip, value, through, surface_value, quality, normal, sides, shape,
-    voxel_size, max_range, enough, quality_range, side_weight,
+    positions, directions, solid_angles, kind, skip, value, through, surface_value, quality, normal, clear, open_bits,
+    cell_value, shape, voxel_size, max_range, enough, quality_range,
 ):
     """Expected reward that arrives at each position from each direction of a sphere of rays.
 
     A ray stands for its solid angle: marching in steps of one voxel it collects value * transmittance times the
     number of voxels that its cone holds there, r^2 dOmega ds / voxel^3. Near voxels are crossed by many rays and
     far ones by few, and each still counts once in the sum: no voxel is counted twice, and any set of directions
-    adds up to the reward of the view made of them.
+    adds up to the reward of the view made of them. An open cell has a quarter of a voxel's face.
 
     positions (P, 3), directions (M, 3) world, solid_angles (M,) sr, `skip` (flat uint8) the Chebyshev distance to
     the nearest voxel that is not seen free, `through` the transmittance of a voxel. Returns (P, M) float32.
@@ -69,9 +41,8 @@ def sphere_gain(
             t = np.float32(0.5) * voxel_size
             total, transmittance = ZERO, ONE
             while t < max_range:
-                i = np.int32(np.floor(positions[p, 0] + t * dx))
-                j = np.int32(np.floor(positions[p, 1] + t * dy))
-                k = np.int32(np.floor(positions[p, 2] + t * dz))
+                x, y, z = positions[p, 0] + t * dx, positions[p, 1] + t * dy, positions[p, 2] + t * dz
+                i, j, k = np.int32(np.floor(x)), np.int32(np.floor(y)), np.int32(np.floor(z))
                 if i < 0 or j < 0 or k < 0 or i >= nx or j >= ny or k >= nz:
                     break
                 v = (i * ny + j) * nz + k
@@ -82,11 +53,20 @@ def sphere_gain(
                 size = t / voxel_size
                 area = solid_angles[r] * size * size
                 if what == 2:
+                    bit = np.uint8(0)
+                    if clear[v] | open_bits[v]:
+                        bit = cell_bit(x, y, z)
+                        if clear[v] & bit:
+                            t += np.float32(0.5) * voxel_size
+                            continue
                     share, cos = surface_share(
                         normal, v, dx, dy, dz, voxel_size, t, quality, enough, quality_range
                     )
-                    share += side_share(sides, v, dx, dy, dz, t, enough, quality_range, side_weight)
                     total += transmittance * surface_value[v] * share * area / max(cos, LEAST_COS)
+                    if open_bits[v] & bit:
+                        total += transmittance * cell_value[v] * np.float32(4) * area * cell_share(
+                            t, enough, quality_range
+                        )
                     break
                 total += transmittance * value[v] * area
                 transmittance *= through[v]
@@ -99,38 +79,34 @@ def sphere_gain(
 
 @njit(parallel=True, fastmath=True, cache=True)
 def frustum_gain(
-    origins, rotations, fan, opaque, kind, value, log_through, surface_value, quality, normal, sides, gain_imp,
-    gain_exp, shape, voxel_size, max_range, enough, quality_range, side_weight,
+    origins, rotations, fan, opaque, kind, value, log_through, surface_value, quality, normal, clear, open_bits,
+    cell_value, gain_imp, gain_exp, shape, voxel_size, max_range, enough, quality_range,
 ):
     """Exact sums over the unique visible voxels of every candidate view.
 
     origins (C, 3), rotations (C, 3, 3) camera to world, fan (M, 3) unit camera rays. A voxel counts at the first
-    ray of the fan that crosses it, with that ray's transmittance; stamps keep it from counting twice. Returns
-    (C, 6) float64: reward, surface part, gain_imp, gain_exp, number visible, number open.
+    ray of the fan that crosses it, with that ray's transmittance; stamps keep it from counting twice, and so for open
+    cells. Returns (C, 6) float64: reward, surface part, gain_imp, gain_exp, number visible, number open.
     """
-    nx, ny, nz = shape
+    size = shape[0] * shape[1] * shape[2]
     count = origins.shape[0]
     out = np.zeros((count, 6), np.float64)
     chunks = min(4, count)
     for chunk in prange(chunks):
-        stamp = np.full(nx * ny * nz, -1, np.int32)
-        ids = np.empty(nx + ny + nz + 3, np.int32)
+        stamp = np.full(size, -1, np.int32)
+        cells = np.zeros(size, np.uint8)
+        ids = np.empty(shape[0] + shape[1] + shape[2] + 3, np.int32)
         for c in range(chunk, count, chunks):
-            R = rotations[c]
-            ox, oy, oz = origins[c, 0], origins[c, 1], origins[c, 2]
             for r in range(fan.shape[0]):
-                x, y, z = fan[r, 0], fan[r, 1], fan[r, 2]
-                dx = (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z) / voxel_size
-                dy = (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z) / voxel_size
-                dz = (R[2, 0] * x + R[2, 1] * y + R[2, 2] * z) / voxel_size
-                n = walk_ray(opaque, ox, oy, oz, dx, dy, dz, max_range, nx, ny, nz, ids)
+                n, bit, (dx, dy, dz), piece = cast(
+                    opaque, clear, origins[c], rotations[c], fan[r], voxel_size, max_range, shape, ids
+                )
                 transmittance, depth = ONE, ZERO
-                # A transmittance belongs to the length of one voxel; a slanted ray crosses more, in shorter pieces.
-                piece = ONE / (voxel_size * (abs(dx) + abs(dy) + abs(dz)))
                 for m in range(n):
                     v = ids[m]
                     if stamp[v] != c:
                         stamp[v] = c
+                        cells[v] = 0
                         out[c, 4] += transmittance
                         if kind[v] == 1:
                             out[c, 0] += transmittance * value[v]
@@ -138,22 +114,25 @@ def frustum_gain(
                             out[c, 3] += transmittance * gain_exp[v]
                             out[c, 5] += transmittance
                         elif kind[v] == 2:
-                            a = np.float32(v // (ny * nz)) + np.float32(0.5) - ox
-                            b = np.float32((v // nz) % ny) + np.float32(0.5) - oy
-                            d = np.float32(v % nz) + np.float32(0.5) - oz
-                            t = voxel_size * np.sqrt(a * a + b * b + d * d)
+                            t = distance_to(origins[c], v, shape, voxel_size)
                             share, _ = surface_share(
                                 normal, v, dx, dy, dz, voxel_size, t, quality, enough, quality_range
                             )
-                            side = side_share(sides, v, dx, dy, dz, t, enough, quality_range, side_weight)
-                            out[c, 0] += transmittance * surface_value[v] * (share + side)
-                            out[c, 1] += transmittance * surface_value[v] * (share + side)
+                            out[c, 0] += transmittance * surface_value[v] * share
+                            out[c, 1] += transmittance * surface_value[v] * share
                             if quality[v] < enough:
                                 # gain_* hold what a perfect look would bring; this one brings a part of it.
                                 part = transmittance * share / (ONE - quality[v] / enough)
                                 out[c, 2] += part * gain_imp[v]
                                 out[c, 3] += part * gain_exp[v]
+                    if kind[v] == 2 and open_bits[v] & bit and not cells[v] & bit:
+                        cells[v] |= bit
+                        t = distance_to(origins[c], v, shape, voxel_size)
+                        worth = transmittance * cell_value[v] * cell_share(t, enough, quality_range)
+                        out[c, 0] += worth
+                        out[c, 1] += worth
                     if kind[v] == 1:
+                        # A transmittance belongs to the length of one voxel.
                         depth += log_through[v] * piece
                         transmittance = np.exp(depth)
                         if transmittance < LEAST_TRANSMITTANCE:
@@ -163,29 +142,23 @@ def frustum_gain(
 
 @njit(parallel=True, fastmath=True, cache=True)
 def path_gain(
-    origins, rotations, fan, opaque, kind, log_through, quality, normal, gain_imp, gain_exp, shape, voxel_size,
+    origins, rotations, fan, opaque, kind, log_through, quality, normal, clear, gain_imp, gain_exp, shape, voxel_size,
     max_range, enough, quality_range,
 ):
     """(gain_imp, gain_exp) of all poses together, float64: every voxel once, at the best of its looks.
 
     Arguments as of `frustum_gain`.
     """
-    nx, ny, nz = shape
-    chunks = 2
-    best = np.zeros((chunks, nx * ny * nz), np.float32)
+    size, chunks = shape[0] * shape[1] * shape[2], 2
+    best = np.zeros((chunks, size), np.float32)
     for chunk in prange(chunks):
-        ids = np.empty(nx + ny + nz + 3, np.int32)
+        ids = np.empty(shape[0] + shape[1] + shape[2] + 3, np.int32)
         for c in range(chunk, origins.shape[0], chunks):
-            R = rotations[c]
-            ox, oy, oz = origins[c, 0], origins[c, 1], origins[c, 2]
             for r in range(fan.shape[0]):
-                x, y, z = fan[r, 0], fan[r, 1], fan[r, 2]
-                dx = (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z) / voxel_size
-                dy = (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z) / voxel_size
-                dz = (R[2, 0] * x + R[2, 1] * y + R[2, 2] * z) / voxel_size
-                n = walk_ray(opaque, ox, oy, oz, dx, dy, dz, max_range, nx, ny, nz, ids)
+                n, _, (dx, dy, dz), piece = cast(
+                    opaque, clear, origins[c], rotations[c], fan[r], voxel_size, max_range, shape, ids
+                )
                 transmittance, depth = ONE, ZERO
-                piece = ONE / (voxel_size * (abs(dx) + abs(dy) + abs(dz)))
                 for m in range(n):
                     v = ids[m]
                     if kind[v] == 0:
@@ -193,10 +166,7 @@ def path_gain(
                     if kind[v] == 1:
                         best[chunk, v] = max(best[chunk, v], transmittance)
                     elif quality[v] < enough:
-                        a = np.float32(v // (ny * nz)) + np.float32(0.5) - ox
-                        b = np.float32((v // nz) % ny) + np.float32(0.5) - oy
-                        d = np.float32(v % nz) + np.float32(0.5) - oz
-                        t = voxel_size * np.sqrt(a * a + b * b + d * d)
+                        t = distance_to(origins[c], v, shape, voxel_size)
                         share, _ = surface_share(normal, v, dx, dy, dz, voxel_size, t, quality, enough, quality_range)
                         best[chunk, v] = max(best[chunk, v], transmittance * share / (ONE - quality[v] / enough))
                     depth += log_through[v] * (piece if kind[v] == 1 else ONE)
@@ -204,7 +174,7 @@ def path_gain(
                     if transmittance < LEAST_TRANSMITTANCE:
                         break
     out = np.zeros(2, np.float64)
-    for v in range(nx * ny * nz):
+    for v in range(size):
         share = max(best[0, v], best[1, v])
         if share > ZERO:
             out[0] += share * gain_imp[v]
@@ -212,87 +182,41 @@ def path_gain(
     return out
 
 
-@njit(parallel=True, fastmath=True, cache=True)
-def mark_sides(origins, rotations, fan, kind, skip, shape, voxel_size, max_range):
-    """Octants (`heading`) that rays of past views came in by at the surface voxel they ended in, (size,) uint8."""
-    nx, ny, nz = shape
-    chunks = 2
-    seen = np.zeros((chunks, nx * ny * nz), np.uint8)
-    for chunk in prange(chunks):
-        for c in range(chunk, origins.shape[0], chunks):
-            R = rotations[c]
-            ox, oy, oz = origins[c, 0], origins[c, 1], origins[c, 2]
-            for r in range(fan.shape[0]):
-                x, y, z = fan[r, 0], fan[r, 1], fan[r, 2]
-                dx = (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z) / voxel_size
-                dy = (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z) / voxel_size
-                dz = (R[2, 0] * x + R[2, 1] * y + R[2, 2] * z) / voxel_size
-                t = np.float32(0.5) * voxel_size
-                while t < max_range:
-                    i = np.int32(np.floor(ox + t * dx))
-                    j = np.int32(np.floor(oy + t * dy))
-                    k = np.int32(np.floor(oz + t * dz))
-                    if i < 0 or j < 0 or k < 0 or i >= nx or j >= ny or k >= nz:
-                        break
-                    v = (i * ny + j) * nz + k
-                    if kind[v] == 2:
-                        seen[chunk, v] |= heading(dx, dy, dz)
-                        break
-                    t += voxel_size * np.float32(max(1, skip[v]) if kind[v] == 0 else 1)
-    return seen[0] | seen[1]
-
-
-@njit(parallel=True, cache=True)
-def surface_normals(kind, out):
-    """Direction from each surface voxel towards its seen-free neighbours, components * 127, int8 [X, Y, Z, 3]."""
-    nx, ny, nz = kind.shape
-    for i in prange(nx):
-        for j in range(ny):
-            for k in range(nz):
-                if kind[i, j, k] != 2:
-                    continue
-                x = y = z = np.float32(0.0)
-                for a in range(max(0, i - 2), min(nx, i + 3)):
-                    for b in range(max(0, j - 2), min(ny, j + 3)):
-                        for c in range(max(0, k - 2), min(nz, k + 3)):
-                            if kind[a, b, c] == 0:
-                                u, v, w = np.float32(a - i), np.float32(b - j), np.float32(c - k)
-                                n = np.sqrt(u * u + v * v + w * w)
-                                x += u / n
-                                y += v / n
-                                z += w / n
-                n = np.sqrt(x * x + y * y + z * z)
-                if n > np.float32(1e-3):
-                    out[i, j, k, 0] = np.int8(np.round(np.float32(127) * x / n))
-                    out[i, j, k, 1] = np.int8(np.round(np.float32(127) * y / n))
-                    out[i, j, k, 2] = np.int8(np.round(np.float32(127) * z / n))
+@njit(fastmath=True, cache=True)
+def mark_seen(origin, R, fan, opaque, clear, shape, voxel_size, max_range, seen, cells):
+    """seen = 1 in every voxel that a view meets, cells |= bits of the cells that its rays end in; flat."""
+    ids = np.empty(shape[0] + shape[1] + shape[2] + 3, np.int32)
+    for r in range(fan.shape[0]):
+        n, bit, _, _ = cast(opaque, clear, origin, R, fan[r], voxel_size, max_range, shape, ids)
+        for m in range(n):
+            seen[ids[m]] = 1
+        if n > 0:
+            cells[ids[n - 1]] |= bit
 
 
 @njit(parallel=True, fastmath=True, cache=True)
 def count_looks(
-    origins, rotations, fan, stops, kind, quality, normal, shape, voxel_size, max_range, enough, quality_range
+    origins, rotations, weights, fan, stops, kind, quality, normal, clear, open_bits, shape, voxel_size, max_range,
+    enough, quality_range,
 ):
-    """How many of the past views looked at each voxel without the result that they promised, (size,) int32.
+    """How many of the past views looked at each voxel, and at open cells of it, in vain; (2, size) float32.
 
+    View c counts for weights[c] looks.
     `stops` (flat uint8) holds every voxel in which any ray ever ended. An open voxel on the way there should have
     been settled by the ray: had it returned, it would have passed or ended there. A surface voxel that it meets
-    should have come up to the quality of its distance and angle; half of that is demanded.
+    should have come up to the quality of its distance and angle; half of that is demanded. An open cell in which it
+    ends should be open no more.
     """
-    nx, ny, nz = shape
-    count, chunks = origins.shape[0], 2
-    looks = np.zeros((chunks, nx * ny * nz), np.int32)
+    size, count, chunks = shape[0] * shape[1] * shape[2], origins.shape[0], 2
+    looks = np.zeros((chunks, 2, size), np.float32)
     for chunk in prange(chunks):
-        stamp = np.full(nx * ny * nz, -1, np.int32)
-        ids = np.empty(nx + ny + nz + 3, np.int32)
+        stamp, cell_stamp = np.full(size, -1, np.int32), np.full(size, -1, np.int32)
+        ids = np.empty(shape[0] + shape[1] + shape[2] + 3, np.int32)
         for c in range(chunk, count, chunks):
-            R = rotations[c]
-            ox, oy, oz = origins[c, 0], origins[c, 1], origins[c, 2]
             for r in range(fan.shape[0]):
-                x, y, z = fan[r, 0], fan[r, 1], fan[r, 2]
-                dx = (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z) / voxel_size
-                dy = (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z) / voxel_size
-                dz = (R[2, 0] * x + R[2, 1] * y + R[2, 2] * z) / voxel_size
-                n = walk_ray(stops, ox, oy, oz, dx, dy, dz, max_range, nx, ny, nz, ids)
+                n, bit, (dx, dy, dz), _ = cast(
+                    stops, clear, origins[c], rotations[c], fan[r], voxel_size, max_range, shape, ids
+                )
                 for m in range(n):
                     v = ids[m]
                     if kind[v] == 0:
@@ -300,15 +224,17 @@ def count_looks(
                     if stamp[v] != c:
                         promised = kind[v] == 1 and stops[v] == 0
                         if kind[v] == 2:
-                            a = np.float32(v // (ny * nz)) + np.float32(0.5) - ox
-                            b = np.float32((v // nz) % ny) + np.float32(0.5) - oy
-                            d = np.float32(v % nz) + np.float32(0.5) - oz
-                            t = voxel_size * np.sqrt(a * a + b * b + d * d)
+                            t = distance_to(origins[c], v, shape, voxel_size)
                             share, _ = surface_share(
                                 normal, v, dx, dy, dz, voxel_size, t, quality, enough, quality_range
                             )
                             promised = share > np.float32(0.5) * (ONE - quality[v] / enough)
                         if promised:
                             stamp[v] = c
-                            looks[chunk, v] += 1
+                            looks[chunk, 0, v] += weights[c]
+                    if kind[v] == 2 and open_bits[v] & bit and cell_stamp[v] != c:
+                        t = distance_to(origins[c], v, shape, voxel_size)
+                        if cell_share(t, enough, quality_range) >= ONE:
+                            cell_stamp[v] = c
+                            looks[chunk, 1, v] += weights[c]
     return looks[0] + looks[1]

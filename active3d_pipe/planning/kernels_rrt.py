@@ -79,7 +79,8 @@ def rrt_star(
 
     seed_path (K, 3) voxel units, seed_cost (K - 1,) cost of its edges; samples (N, 3) points to steer to;
     step, radius, spacing in voxels; `least_rate` a lower bound of `rate`, which makes the search informed: a
-    sample that cannot lie on a better path is skipped. Returns the path (M, 3) and its cost in voxels.
+    sample that cannot lie on a better path is skipped. Returns the path (M, 3), its cost in voxels, and how many
+    places along edges were checked on the way.
     """
     k = seed_path.shape[0]
     capacity = k + samples.shape[0]
@@ -95,6 +96,7 @@ def rrt_star(
             cost[m] = cost[m - 1] + seed_cost[m - 1]
     start, goal = pos[0].copy(), k - 1
     count = k
+    checks = 0
     new = np.empty(3, np.float32)
     for s in range(samples.shape[0]):
         x = samples[s]
@@ -114,8 +116,10 @@ def rrt_star(
         chosen, chosen_cost = -1, FAR
         for m in range(count):
             edge[m] = FAR
-            if m != near and _distance(pos[m], new) > radius:
+            reach = _distance(pos[m], new)
+            if m != near and reach > radius:
                 continue
+            checks += int(np.ceil(reach / spacing)) + 1
             edge[m] = segment_cost(
                 pos[m], new, rate, clearance, required, escape, start, escape_radius, spacing
             )
@@ -132,6 +136,7 @@ def rrt_star(
             if edge[m] >= FAR or m == chosen:
                 continue
             if chosen_cost + edge[m] < cost[m] - np.float32(1e-4):
+                checks += int(np.ceil(_distance(new, pos[m]) / spacing)) + 1
                 # The edge is re-measured in its true direction: near the start the rules are not symmetric.
                 e = segment_cost(
                     new, pos[m], rate, clearance, required, escape, start, escape_radius, spacing
@@ -149,4 +154,4 @@ def rrt_star(
     path = np.empty((n, 3), np.float32)
     for m in range(n):
         path[m] = pos[stack[n - 1 - m]]
-    return path, cost[goal]
+    return path, cost[goal], checks

@@ -4,15 +4,21 @@
 import numpy as np
 from numba import njit, prange
 
-ZERO, ONE = np.float32(0.0), np.float32(1.0)
+from active3d_pipe.planning.kernels_sight import cell_bit
+
+ZERO, QUARTER, HALF, ONE = np.float32(0.0), np.float32(0.25), np.float32(0.5), np.float32(1.0)
 
 
 @njit(parallel=True, cache=True)
-def best_viewpoints(targets, places, opaque, through, normal, shape, nearest, farthest, falloff, steps, view_steps):
+def best_viewpoints(
+    targets, cells, places, opaque, clear, through, normal, shape, nearest, farthest, falloff, steps, view_steps
+):
     """For every target voxel the places with the best look and with the best look per step to get there.
 
-    targets (T, 3), places (P, 3) int32 voxels; `opaque` (flat uint8) stops sight, `through` (flat float32) is the
-    transmittance of a voxel; `normal` (size, 3) int8 the side that a surface target is seen from, zero = any.
+    targets (T, 3), places (P, 3) int32 voxels; `cells` (T,) uint8 is the bit of the half-size cell that is meant, 0 =
+    the whole voxel; `opaque` (flat uint8) stops sight outside the cells of `clear`, `through` (flat float32) is the
+    transmittance of a voxel; `normal` (size, 3) int8 the side that a surface target is seen from, zero = any
+    (of a cell, any that has sight).
     Distances in voxels: places `nearest`..`farthest` from the target are tried, beyond `falloff` a look loses with
     1 / distance. `steps` (P,) float32 until the place is reached. A look is worth its transmittance times that
     loss times |cos| of incidence. Returns (T, 2) int32 indices into `places`, -1 = none sees it; ties: the first.
@@ -24,9 +30,21 @@ def best_viewpoints(targets, places, opaque, through, normal, shape, nearest, fa
         target = (ti * ny + tj) * nz + tk
         a, b, c = np.float32(normal[target, 0]), np.float32(normal[target, 1]), np.float32(normal[target, 2])
         norm = np.sqrt(a * a + b * b + c * c)
+        ox, oy, oz = np.float32(ti) + HALF, np.float32(tj) + HALF, np.float32(tk) + HALF
+        pieces = 1
+        if cells[n]:
+            norm, pieces = ZERO, 2
+            cell = 0
+            while cells[n] >> cell > 1:
+                cell += 1
+            ox += QUARTER if cell & 4 else -QUARTER
+            oy += QUARTER if cell & 2 else -QUARTER
+            oz += QUARTER if cell & 1 else -QUARTER
         best, best_rate = np.float32(0.05), ZERO
         for p in range(places.shape[0]):
-            x, y, z = np.float32(places[p, 0] - ti), np.float32(places[p, 1] - tj), np.float32(places[p, 2] - tk)
+            x = np.float32(places[p, 0]) + HALF - ox
+            y = np.float32(places[p, 1]) + HALF - oy
+            z = np.float32(places[p, 2]) + HALF - oz
             distance = np.sqrt(x * x + y * y + z * z)
             if distance < nearest or distance > farthest:
                 continue
@@ -38,22 +56,20 @@ def best_viewpoints(targets, places, opaque, through, normal, shape, nearest, fa
                 look *= cos
             if look <= best and look <= best_rate * (steps[p] + view_steps):
                 continue
-            m = int(np.ceil(distance))
+            m = pieces * int(np.ceil(distance))
             passed = ONE
             last = -1
             for s in range(1, m):
                 f = np.float32(s) / np.float32(m)
-                i, j, k = (
-                    int(np.floor(ti + f * x + np.float32(0.5))), int(np.floor(tj + f * y + np.float32(0.5))),
-                    int(np.floor(tk + f * z + np.float32(0.5))),
-                )  # fmt: skip
-                v = (i * ny + j) * nz + k
-                if v == target or v == last:  # noqa: SIM109  (plain comparisons compile to nothing)
-                    continue
-                last = v
+                fx, fy, fz = ox + f * x, oy + f * y, oz + f * z
+                v = (int(fx) * ny + int(fy)) * nz + int(fz)
                 if opaque[v]:
-                    passed = ZERO
-                else:
+                    if v == target and (cells[n] == 0 or cell_bit(fx, fy, fz) == cells[n]):
+                        continue
+                    if not clear[v] or not clear[v] & cell_bit(fx, fy, fz):
+                        passed = ZERO
+                elif v != target and v != last:
+                    last = v
                     passed *= through[v]
                 if passed < np.float32(0.05):
                     break

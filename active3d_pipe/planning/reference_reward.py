@@ -20,26 +20,54 @@ def surface_share(field: RewardField, v: int, direction: np.ndarray, distance_m:
     return max(0.0, min(new, enough) - float(field.quality[v])) / enough, cos
 
 
-def side_share(field: RewardField, v: int, direction: np.ndarray, distance_m: float) -> float:
-    """What a look from a side that surface voxel `v` was not seen from is worth."""
-    octant = sum(2**axis for axis in range(3) if direction[axis] > 0)
-    if field.sides[v] & 2**octant:
-        return 0.0
-    return field.side_weight * min(1.0, field.quality_range_m / (distance_m * field.enough_quality))
+def cell_share(field: RewardField, distance_m: float) -> float:
+    """What a look at an open cell is worth of its value."""
+    return min(1.0, field.quality_range_m / (distance_m * field.enough_quality))
+
+
+def cell_bit(point: np.ndarray) -> int:
+    """Bit of the half-size cell in which a point lies, voxel units."""
+    upper = np.floor(2 * np.asarray(point)).astype(int) % 2
+    return int(1 << (4 * upper[0] + 2 * upper[1] + upper[2]))
+
+
+def sight(field: RewardField, origin: np.ndarray, direction: np.ndarray) -> tuple[list[tuple[int, int, int]], int]:
+    """Voxels that a ray crosses, without surface voxels that it passes, and the bit of the cell that stops it."""
+    grid = field.grid
+    length = field.max_range_m / grid.voxel_size
+    out: list[tuple[int, int, int]] = []
+    for ijk in traverse(np.zeros(grid.shape, bool), origin, direction, length):
+        v = int(np.ravel_multi_index(ijk, grid.shape))
+        if field.kind[v] != SURFACE:
+            out.append(ijk)
+            continue
+        with np.errstate(divide="ignore"):
+            faces = (np.asarray(ijk)[None] + [[0, 0, 0], [1, 1, 1]] - origin) / direction
+        t0, t1 = max(0.0, faces.min(axis=0).max()), faces.max(axis=0).min()
+        bits = [cell_bit(origin + (t0 + f * (t1 - t0)) * direction) for f in (1 / 6, 3 / 6, 5 / 6)]
+        blocked = [bit for bit in bits if not field.clear[v] & bit]
+        if blocked:
+            return [*out, ijk], blocked[0]
+    return out, 0
 
 
 def exact_terms(field: RewardField, T_world_camera: np.ndarray, fan: np.ndarray) -> GainTerms:
     """Gain of one view over its unique visible voxels; fan (M, 3) unit rays in the camera frame."""
     grid = field.grid
     origin = (T_world_camera[:3, 3] - grid.origin) / grid.voxel_size
-    opaque = field.opaque.reshape(grid.shape).astype(bool)
     seen: set[int] = set()
+    seen_cells: set[tuple[int, int]] = set()
     reward = surface = imp = exp = visible = unsettled = 0.0
     for ray in fan:
         direction = T_world_camera[:3, :3] @ ray
         transmittance = 1.0
-        for ijk in traverse(opaque, origin, direction, field.max_range_m / grid.voxel_size):
+        voxels, bit = sight(field, origin, direction)
+        for ijk in voxels:
             v = int(np.ravel_multi_index(ijk, grid.shape))
+            distance = grid.voxel_size * float(np.linalg.norm(np.asarray(ijk) + 0.5 - origin))
+            if field.kind[v] == SURFACE and field.open_bits[v] & bit and (v, bit) not in seen_cells:
+                seen_cells.add((v, bit))
+                surface += transmittance * field.cell_value[v] * cell_share(field, distance)
             if v not in seen:
                 seen.add(v)
                 visible += transmittance
@@ -49,10 +77,8 @@ def exact_terms(field: RewardField, T_world_camera: np.ndarray, fan: np.ndarray)
                     exp += transmittance * field.gain_exp[v]
                     unsettled += transmittance
                 elif field.kind[v] == SURFACE:
-                    distance = grid.voxel_size * float(np.linalg.norm(np.asarray(ijk) + 0.5 - origin))
                     share, _ = surface_share(field, v, direction, distance)
-                    side = side_share(field, v, direction, distance)
-                    surface += transmittance * field.surface_value[v] * (share + side)
+                    surface += transmittance * field.surface_value[v] * share
                     left = 1 - field.quality[v] / field.enough_quality
                     if left > 0:
                         imp += transmittance * share / left * field.gain_imp[v]
@@ -73,14 +99,20 @@ def sphere_gain(field: RewardField, position: np.ndarray, rays: np.ndarray, soli
     for r, (direction, angle) in enumerate(zip(rays, solid_angles, strict=True)):
         transmittance, t = 1.0, 0.5 * size
         while t < field.max_range_m:
-            ijk = np.floor(position + t * direction / size).astype(int)
+            point = position + t * direction / size
+            ijk = np.floor(point).astype(int)
             if not grid.contains_index(ijk):
                 break
             v = int(np.ravel_multi_index(tuple(ijk), grid.shape))
             area = angle * (t / size) ** 2
             if field.kind[v] == SURFACE:
+                bit = cell_bit(point)
+                if field.clear[v] & bit:
+                    t += 0.5 * size
+                    continue
                 share, cos = surface_share(field, v, direction, t)
-                share += side_share(field, v, direction, t)
+                if field.open_bits[v] & bit:
+                    out[r] += transmittance * field.cell_value[v] * 4 * area * cell_share(field, t)
                 out[r] += transmittance * field.surface_value[v] * share * area / max(cos, LEAST_COS)
                 break
             if field.kind[v] != FREE:

@@ -6,13 +6,13 @@ of single views and returns their `GainTerms`. Unknown space lets rays pass, but
 the share 1 - exp(-size / free path), so a voxel counts with the probability that it is visible at all.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from active3d_pipe.geometry.voxel_traversal import fan_stride, ray_fan
-from active3d_pipe.information.gain import FREE, OPEN, SURFACE, GainTerms, InformationVolumes, information_volumes
-from active3d_pipe.planning import kernels_distance
+from active3d_pipe.information.gain import FREE, OPEN, SURFACE, GainTerms, classify, information_volumes
+from active3d_pipe.planning import kernels_distance, kernels_sight
 from active3d_pipe.planning import kernels_reward as kernels
 from active3d_pipe.planning.candidates import Directions
 from active3d_pipe.planning.config import PlanningSettings
@@ -22,6 +22,8 @@ from active3d_pipe.structures.voxel_grid import VoxelGrid
 
 # Longest jump of a ray through seen free space, voxels.
 LONGEST_SKIP = 12
+# Poses of one place that make one look: steps are short.
+POSES_A_LOOK = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,18 +42,26 @@ class RewardField:
     surface_value: np.ndarray
     quality: np.ndarray
     normal: np.ndarray
-    sides: np.ndarray
-    side_weight: float
+    clear: np.ndarray
+    open_bits: np.ndarray
+    cell_value: np.ndarray
     gain_imp: np.ndarray
     gain_exp: np.ndarray
 
-    def without(self, visible: np.ndarray) -> "RewardField":
-        """The same field after the voxels `visible` (flat ids) have been seen: nothing is left to gain in them."""
+    def after(self, T_world_camera: np.ndarray, camera: Camera) -> "RewardField":
+        """The same field after a view from pose (4, 4): nothing is left to gain in what it sees."""
+        grid = self.grid
+        seen, cells = np.zeros(grid.size, np.uint8), np.zeros(grid.size, np.uint8)
+        origin, rotation = (a[0] for a in _in_voxels(grid, T_world_camera[None]))
+        fan = ray_fan(camera, fan_stride(camera, grid.voxel_size, self.max_range_m))[2].astype(np.float32)
+        kernels.mark_seen(
+            origin, rotation, fan, self.opaque, self.clear, grid.shape, np.float32(grid.voxel_size),
+            np.float32(self.max_range_m), seen, cells,
+        )
         changed = {name: getattr(self, name).copy() for name in ("value", "surface_value", "gain_imp", "gain_exp")}
         for a in changed.values():
-            a[visible] = 0
-        fields = {name: getattr(self, name) for name in self.__slots__}
-        return RewardField(**{**fields, **changed})
+            a[seen > 0] = 0
+        return replace(self, **changed, open_bits=self.open_bits & ~cells)
 
 
 def build_reward_field(
@@ -64,23 +74,47 @@ def build_reward_field(
     grid, information = volume.grid, settings.information
     enough = information.enough_quality(camera.fx)
     reach = min(settings.max_range_m, camera.far)
-    first = information_volumes(volume.arrays, information, enough)
-    kind = first.kind
+    kind = classify(volume.arrays, information)
     through = _transmittance(volume, kind, settings)
     normal = np.zeros((*grid.shape, 3), np.int8)
-    kernels.surface_normals(kind, normal)
+    kernels_sight.surface_normals(kind, normal)
+    clear, open_bits = _cells(volume, kind)
     skip = kernels_distance.distance_transform((kind != FREE).view(np.uint8), LONGEST_SKIP, True).astype(np.uint8)
     opaque = (kind == SURFACE).view(np.uint8).ravel()
-    quality = np.ascontiguousarray(first.quality).ravel()
-    looks = _looks(volume, kind.ravel(), quality, normal.reshape(-1, 3), walked_poses, camera, settings)
-    credit = np.float32(settings.credit_factor) ** looks.astype(np.float32)
-    volumes: InformationVolumes = information_volumes(volume.arrays, information, enough, credit.reshape(grid.shape))
+    quality = np.ascontiguousarray(volume["view_quality"]).ravel()
+    cells = clear.ravel(), open_bits.ravel()
+    looks = _looks(volume, kind.ravel(), quality, normal.reshape(-1, 3), cells, walked_poses, camera, settings)
+    credit, cell_credit = np.float32(settings.credit_factor) ** looks
+    # An eighth of what an open voxel is worth that may turn out either way, times the weight.
+    whole = settings.cell_weight * (information.alpha + information.beta) / 16
+    volumes = information_volumes(volume.arrays, information, enough, credit.reshape(grid.shape))
     return RewardField(
         grid, information.quality_range_m(camera.fx), enough, reach, kind.ravel(), opaque, skip.ravel(),
         volumes.value.ravel(), through, volumes.surface_value.ravel(), quality, normal.reshape(-1, 3),
-        _sides(volume.grid, kind.ravel(), skip.ravel(), walked_poses, camera, settings), settings.side_weight,
+        *cells, np.float32(whole) * cell_credit,
         volumes.gain_imp.ravel(), volumes.gain_exp.ravel(),
     )
+
+
+def _in_voxels(grid: VoxelGrid, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Origins (N, 3) in voxel units and rotations (N, 3, 3) of poses (N, 4, 4), as the kernels take them."""
+    origins = np.ascontiguousarray((poses[:, :3, 3] - grid.origin) / grid.voxel_size, dtype=np.float32)
+    return origins, np.ascontiguousarray(poses[:, :3, :3], dtype=np.float32)
+
+
+def _cells(volume: UncertaintyVolume, kind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Clear and open half-size cells of every voxel, uint8 bits [X, Y, Z] (`kernels_sight`).
+
+    A voxel is larger than what is in it: the underside of a table, the edge of a frame, the gap behind a sofa lie in
+    voxels that count as surface seen, from the other side. A volume without cells has no open ones, and its surface
+    stops sight everywhere.
+    """
+    passed, ended = (volume[name].astype(np.uint8) for name in ("cells_passed", "cells_hit"))
+    clear = np.where((kind == FREE) & (volume["hit_evidence"] == 0), np.uint8(255), passed & ~ended)
+    found = np.zeros(kind.shape, np.uint8)
+    if ended.any():
+        kernels_sight.open_cells(kind, clear, ~(passed | ended), found)
+    return clear, found
 
 
 def _transmittance(volume: UncertaintyVolume, kind: np.ndarray, settings: PlanningSettings) -> np.ndarray:
@@ -106,51 +140,49 @@ def spread_poses(poses: np.ndarray, count: int) -> np.ndarray:
     return len(x) - 1 - np.asarray(chosen[:count], dtype=np.int64)
 
 
+def repeated_poses(poses: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of at most `count` poses that stand for all, and float32 how many looks each of them stands for.
+
+    Half of them are well spread, half are those whose surroundings (half a metre, 30 degrees) were taken most often:
+    an agent that keeps looking at what it cannot settle must notice it.
+    """
+    x = np.round(np.concatenate([poses[:, :3, 3] / 0.5, poses[:, :3, 2] / 0.52], axis=1)).astype(np.int64)
+    _, newest, inverse, counts = np.unique(x[::-1], axis=0, return_index=True, return_inverse=True, return_counts=True)
+    place = inverse.ravel()[::-1]
+    crowded = len(x) - 1 - newest[np.lexsort((newest, -counts))[: count - count // 2]]
+    chosen, taken = [], set()
+    for i in [*crowded.tolist(), *spread_poses(poses, count // 2).tolist()]:
+        if place[i] not in taken:
+            taken.add(place[i])
+            chosen.append(i)
+    index = np.asarray(chosen, dtype=np.int64)
+    return index, np.maximum(1, counts[place[index]] / np.float32(POSES_A_LOOK)).astype(np.float32)
+
+
 def _looks(
     volume: UncertaintyVolume,
     kind: np.ndarray,
     quality: np.ndarray,
     normal: np.ndarray,
+    cells: tuple[np.ndarray, np.ndarray],
     poses: np.ndarray,
     camera: Camera,
     settings: PlanningSettings,
 ) -> np.ndarray:
-    """How many past views promised something of each voxel that did not come true, (size,)."""
+    """How many past views promised something of each voxel, of its open cells, that did not come true, (2, size)."""
     grid = volume.grid
     if len(poses) == 0 or settings.credit_views == 0:
-        return np.zeros(grid.size, np.int32)
+        return np.zeros((2, grid.size), np.float32)
     reach = min(settings.max_range_m, camera.far)
     # Coarser rays than for scoring: a voxel that only a corner of the fan touches was not really looked at.
     fan = ray_fan(camera, 2 * fan_stride(camera, grid.voxel_size, reach))[2].astype(np.float32)
     stops = ((kind == SURFACE) | (volume["hit_evidence"].ravel() > 0)).view(np.uint8)
-    chosen = poses[spread_poses(poses, settings.credit_views)]
+    chosen, looks = repeated_poses(poses, settings.credit_views)
     return kernels.count_looks(
-        np.ascontiguousarray((chosen[:, :3, 3] - grid.origin) / grid.voxel_size, dtype=np.float32),
-        np.ascontiguousarray(chosen[:, :3, :3], dtype=np.float32), fan, stops, kind, quality, normal,
-        grid.shape, np.float32(grid.voxel_size), np.float32(reach),
+        *_in_voxels(grid, poses[chosen]), looks, fan, stops, kind, quality, normal, *cells, grid.shape,
+        np.float32(grid.voxel_size), np.float32(reach),
         np.float32(settings.information.enough_quality(camera.fx)),
         np.float32(settings.information.quality_range_m(camera.fx)),
-    )
-
-
-def _sides(
-    grid: VoxelGrid, kind: np.ndarray, skip: np.ndarray, poses: np.ndarray, camera: Camera, settings: PlanningSettings
-) -> np.ndarray:
-    """Into which octants looked those who saw each surface voxel, (size,) uint8 bits.
-
-    A voxel is larger than what is in it: the underside of a table, the edge of a frame, the gap behind a sofa lie in
-    voxels that count as seen surface from the other side. Looking at surface from a new side finds them, and spreads
-    the viewpoints, which rendering gains from.
-    """
-    if len(poses) == 0 or settings.side_weight == 0:
-        return np.full(grid.size, 255, np.uint8)
-    reach = min(settings.max_range_m, camera.far)
-    fan = ray_fan(camera, fan_stride(camera, 2 * grid.voxel_size, reach))[2].astype(np.float32)
-    chosen = poses[spread_poses(poses, settings.side_views)]
-    return kernels.mark_sides(
-        np.ascontiguousarray((chosen[:, :3, 3] - grid.origin) / grid.voxel_size, dtype=np.float32),
-        np.ascontiguousarray(chosen[:, :3, :3], dtype=np.float32), fan, kind, skip, grid.shape,
-        np.float32(grid.voxel_size), np.float32(reach),
     )
 
 
@@ -161,8 +193,8 @@ def sphere_rewards(field: RewardField, positions_world: np.ndarray, directions: 
     rays = kernels.sphere_gain(
         np.ascontiguousarray(origins), directions.rays / np.float32(grid.voxel_size), directions.solid_angles,
         field.kind, field.skip, field.value, field.through, field.surface_value, field.quality, field.normal,
-        field.sides, grid.shape, np.float32(grid.voxel_size), np.float32(field.max_range_m),
-        np.float32(field.enough_quality), np.float32(field.quality_range_m), np.float32(field.side_weight),
+        field.clear, field.open_bits, field.cell_value, grid.shape, np.float32(grid.voxel_size),
+        np.float32(field.max_range_m), np.float32(field.enough_quality), np.float32(field.quality_range_m),
     )
     return rays @ directions.members.T
 
@@ -176,11 +208,10 @@ def exact_terms(
     grid = field.grid
     stride = ray_stride or fan_stride(camera, grid.voxel_size, field.max_range_m)
     sums = kernels.frustum_gain(
-        np.ascontiguousarray((poses[:, :3, 3] - grid.origin) / grid.voxel_size, dtype=np.float32),
-        np.ascontiguousarray(poses[:, :3, :3], dtype=np.float32), ray_fan(camera, stride)[2].astype(np.float32),
+        *_in_voxels(grid, poses), ray_fan(camera, stride)[2].astype(np.float32),
         field.opaque, field.kind, field.value, np.log(np.maximum(field.through, np.float32(1e-6))),
-        field.surface_value, field.quality, field.normal, field.sides, field.gain_imp, field.gain_exp, grid.shape,
-        np.float32(grid.voxel_size), np.float32(field.max_range_m),
-        np.float32(field.enough_quality), np.float32(field.quality_range_m), np.float32(field.side_weight),
+        field.surface_value, field.quality, field.normal, field.clear, field.open_bits, field.cell_value,
+        field.gain_imp, field.gain_exp, grid.shape, np.float32(grid.voxel_size), np.float32(field.max_range_m),
+        np.float32(field.enough_quality), np.float32(field.quality_range_m),
     )
     return [GainTerms(s[0], s[1], s[2], s[3], round(s[4]), round(s[5])) for s in sums.tolist()]

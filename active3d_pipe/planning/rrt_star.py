@@ -30,12 +30,14 @@ class PlannedPath:
     Attributes:
         points: (M, 3) float64 world, m; the first is the start, the last the goal.
         cost: integral of eq. risk_path, in equivalent metres. grid_cost: the same for the grid path it began with.
+        num_checks: places along edges at which the tree looked up cost and clearance.
         length_m: its length. max_risk: the highest C_risk on it. min_clearance_m: the least clearance on it.
     """
 
     points: np.ndarray
     cost: float
     grid_cost: float
+    num_checks: int
     length_m: float
     max_risk: float
     min_clearance_m: float
@@ -74,10 +76,10 @@ def plan_path(
     )
     edges = _trusted_costs(seed, check)
     step = np.float32(settings.rrt_step_m / grid.voxel_size)
-    tree = kernels.rrt_star(
+    tree, _, num_checks = kernels.rrt_star(
         seed, edges, _samples(space, start, settings, rng), *check[:4], check[5], step, np.float32(1.5) * step,
         rate.min(), check[6],
-    )[0]
+    )
     path = _shortcut(tree, check)
     points = path.astype(np.float64) * grid.voxel_size + grid.origin
     points[0] = start_world
@@ -88,6 +90,7 @@ def plan_path(
         points,
         cost=float(_trusted_costs(path, check).sum(dtype=np.float64)) * grid.voxel_size,
         grid_cost=float(edges.sum(dtype=np.float64)) * grid.voxel_size,
+        num_checks=num_checks,
         length_m=float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum()),
         max_risk=float(risk.max()),
         min_clearance_m=float(clearance.min()),

@@ -9,6 +9,8 @@ from active3d_pipe.planning.free_space import FreeSpace
 from active3d_pipe.planning.reward import RewardField
 from active3d_pipe.structures.motion import MotionSettings
 
+BIT_COUNT = np.array([bin(n).count("1") for n in range(256)], np.float32)
+
 
 def target_positions(
     space: FreeSpace, field: RewardField, motion: MotionSettings, settings: PlanningSettings
@@ -19,23 +21,27 @@ def target_positions(
     `target_block_m` with the most that is still to be had, and from where each is seen best and soonest.
     """
     grid = space.grid
-    targets = _targets(field, settings)
+    targets, cells = _targets(field, settings)
     lattice = tuple(slice(o % 2, None, 2) for o in space.start)
     places = np.argwhere(space.reachable[lattice]) * 2 + np.array([o % 2 for o in space.start])
     if len(targets) == 0 or len(places) == 0:
         return np.zeros((0, 3), np.int64)
     enough = settings.information.enough_distance_m
     near = kernels_targets.best_viewpoints(
-        targets.astype(np.int32), places.astype(np.int32), field.opaque, field.through, field.normal, grid.shape,
-        np.float32(1.5), np.float32(field.max_range_m / grid.voxel_size), np.float32(enough / grid.voxel_size),
-        space.cost[tuple(places.T)] / np.float32(motion.max_step_m), np.float32(settings.view_steps),
+        targets.astype(np.int32), cells, places.astype(np.int32), field.opaque, field.clear, field.through,
+        field.normal, grid.shape, np.float32(1.5), np.float32(field.max_range_m / grid.voxel_size),
+        np.float32(enough / grid.voxel_size), space.cost[tuple(places.T)] / np.float32(motion.max_step_m),
+        np.float32(settings.view_steps),
     )
     chosen = np.unique(near[near >= 0])
     return places[chosen]
 
 
-def _targets(field: RewardField, settings: PlanningSettings) -> np.ndarray:
-    """(T, 3) int64: of each of the most valuable blocks the voxel with the most value beside seen free space."""
+def _targets(field: RewardField, settings: PlanningSettings) -> tuple[np.ndarray, np.ndarray]:
+    """(T, 3) int64: of each of the most valuable blocks the voxel with the most value beside seen free space.
+
+    And (T,) uint8, the bit of its first open cell where these are worth more than the rest of it, else 0.
+    """
     grid = field.grid
     kind = field.kind.reshape(grid.shape)
     free = kind == FREE
@@ -46,6 +52,9 @@ def _targets(field: RewardField, settings: PlanningSettings) -> np.ndarray:
         a[:-1] |= b[1:]
     rest = np.maximum(0, 1 - field.quality / np.float32(field.enough_quality))
     worth = np.where(field.kind == SURFACE, field.surface_value * rest, field.value) * beside.ravel()
+    in_cells = BIT_COUNT[field.open_bits] * field.cell_value
+    first_open = np.where(in_cells > worth, field.open_bits & (~field.open_bits + np.uint8(1)), 0).astype(np.uint8)
+    worth = worth + in_cells
     ids = np.flatnonzero(worth > 0)
     ijk = np.stack(np.unravel_index(ids, grid.shape), axis=-1)
     block = max(1, round(settings.target_block_m / grid.voxel_size))
@@ -55,4 +64,5 @@ def _targets(field: RewardField, settings: PlanningSettings) -> np.ndarray:
     order = np.lexsort((ids, -worth[ids], key))
     first = order[np.unique(key[order], return_index=True)[1]]
     best = np.argsort(-total[key[first]], kind="stable")[: settings.max_targets]
-    return ijk[first[best]]
+    chosen = first[best]
+    return ijk[chosen], first_open[ids[chosen]]

@@ -22,9 +22,11 @@ VOLUMES: dict[str, tuple[str, str]] = {
     "hit_evidence": ("1", "number of depth rays that ended in the voxel"),
     "view_quality": ("1", "best observation of the voxel's surface so far, 0 = unseen, 1 = close and frontal"),
     "vain_looks": ("1", "rounds in which rays through the voxel came back without a reading, and no other rays went"),
+    "cells_passed": ("1", "bits of the eight half-size cells of the voxel that depth rays passed, 0 to 255"),
+    "cells_hit": ("1", "bits of the eight half-size cells of the voxel that depth rays ended in, 0 to 255"),
 }
-# Layers that a producer may leave out: nothing happened there.
-ZERO_BY_DEFAULT = ("vain_looks",)
+# Layers that a producer may leave out: nothing happened there, or nothing is known about parts of voxels.
+ZERO_BY_DEFAULT = ("vain_looks", "cells_passed", "cells_hit")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

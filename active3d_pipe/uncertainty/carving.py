@@ -12,27 +12,33 @@ from active3d_pipe.uncertainty.config import UncertaintySettings
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RayEvidence:
-    """What depth rays said about every voxel; float32 [X, Y, Z] on one grid.
+    """What depth rays said about every voxel; [X, Y, Z] on one grid, counts and quality float32.
 
     Attributes:
         free: number of rays that passed through the voxel.
         hit: number of rays that ended in it.
         quality: best observation of its surface, 0 = never hit, 1 = frontal, with pixels no wider than the reference.
+        passed, ended: uint8, one bit for each of the eight half-size cells of the voxel: some ray passed it, some ray
+            ended in it. Bit 4 a + 2 b + c, where a, b, c say whether the cell is the upper one in x, y, z.
     """
 
     free: np.ndarray
     hit: np.ndarray
     quality: np.ndarray
+    passed: np.ndarray
+    ended: np.ndarray
 
     @classmethod
     def none(cls, grid: VoxelGrid) -> "RayEvidence":
         """No ray so far."""
-        return cls(*(np.zeros(grid.shape, np.float32) for _ in range(3)))
+        counts, cells = (np.zeros((n, *grid.shape), t) for n, t in ((3, np.float32), (2, np.uint8)))
+        return cls(*counts, *cells)
 
     def joined(self, newer: "RayEvidence") -> "RayEvidence":
-        """Both together: counts add up, the better view stays."""
+        """Both together: counts add up, the better view stays, cells are joined."""
         return RayEvidence(
-            self.free + newer.free, self.hit + newer.hit, np.maximum(self.quality, newer.quality)
+            self.free + newer.free, self.hit + newer.hit, np.maximum(self.quality, newer.quality),
+            self.passed | newer.passed, self.ended | newer.ended,
         )
 
 
@@ -49,6 +55,7 @@ def integrate_depth(grid: VoxelGrid, frames: Sequence[Frame], settings: Uncertai
     shape = (kernels.CHUNKS, *grid.shape)
     free, hit = np.zeros(shape, np.int32), np.zeros(shape, np.int32)
     quality = np.zeros(shape, np.float32)
+    passed, ended = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
     s = settings.ray_stride
     for group in by_image_size(frames):
         starts = np.array([(f.step // s % s, f.step % s) for f in group], np.int64)
@@ -56,9 +63,12 @@ def integrate_depth(grid: VoxelGrid, frames: Sequence[Frame], settings: Uncertai
             np.stack([f.depth for f in group]), intrinsics([f.camera for f in group]),
             np.stack([f.T_world_camera for f in group])[:, :3].astype(np.float64),
             np.array([(f.camera.near, f.camera.far) for f in group], np.float64), starts, s,
-            grid.origin, 1 / grid.voxel_size, settings.reference_footprint_m, free, hit, quality,
+            grid.origin, 1 / grid.voxel_size, settings.reference_footprint_m, free, hit, quality, passed, ended,
         )
-    return RayEvidence(free.sum(0).astype(np.float32), hit.sum(0).astype(np.float32), quality.max(0))
+    return RayEvidence(
+        free.sum(0).astype(np.float32), hit.sum(0).astype(np.float32), quality.max(0),
+        np.bitwise_or.reduce(passed), np.bitwise_or.reduce(ended),
+    )
 
 
 def looks_in_vain(

@@ -86,51 +86,72 @@ def _start(o, d, n, t0, pitch):
     return i, 0, 0, math.inf, math.inf
 
 
-@njit(cache=True)
-def _count_free(ox, oy, oz, ex, ey, ez, shape, free, stamp, frame_id):
-    """Add 1 to every voxel that the segment o -> e (voxel units) crosses and that no ray of this frame hit.
+@njit(cache=True, inline="always")
+def _enter(ox, oy, oz, ex, ey, ez, shape):
+    """Where the segment o -> e (voxel units) enters the grid; the state of the walk that `_advance` carries on.
 
-    Incremental traversal of Amanatides and Woo (1987) on flat volumes of `shape`.
+    Incremental traversal of Amanatides and Woo (1987) on flat volumes of `shape`. Returns (flat id of the voxel, -1
+    when the segment misses the grid; parameters at which it is entered and at which the segment ends; for the three
+    axes: memory steps, voxels left before the grid ends, parameters of the next border, parameters a voxel is long).
     """
     nx, ny, nz = shape
     dx, dy, dz = ex - ox, ey - oy, ez - oz
     t0, t1 = _clip(ox, dx, nx, 0.0, 1.0)
     t0, t1 = _clip(oy, dy, ny, t0, t1)
     t0, t1 = _clip(oz, dz, nz, t0, t1)
-    if t0 >= t1:
-        return
     i, si, left_i, ti, gi = _start(ox, dx, nx, t0, ny * nz)
     j, sj, left_j, tj, gj = _start(oy, dy, ny, t0, nz)
     k, sk, left_k, tk, gk = _start(oz, dz, nz, t0, 1)
-    v = (i * ny + j) * nz + k
-    while True:
-        if stamp[np.uintp(v)] != frame_id:
-            free[np.uintp(v)] += np.int32(1)
-        if ti <= tj and ti <= tk:
-            if ti >= t1 or left_i == 0:
-                return
-            left_i -= 1
-            v += si
-            ti += gi
-        elif tj <= tk:
-            if tj >= t1 or left_j == 0:
-                return
-            left_j -= 1
-            v += sj
-            tj += gj
-        else:
-            if tk >= t1 or left_k == 0:
-                return
-            left_k -= 1
-            v += sk
-            tk += gk
+    v = (i * ny + j) * nz + k if t0 < t1 else -1
+    return v, t0, t1, (si, sj, sk), (left_i, left_j, left_k), (ti, tj, tk), (gi, gj, gk)
+
+
+@njit(cache=True, inline="always")
+def _advance(v, t1, pitch, left, t, length):
+    """(next voxel of the walk or -1 at its end, where it is entered, voxels left, next borders); see `_enter`."""
+    if t[0] <= t[1] and t[0] <= t[2]:
+        v = -1 if t[0] >= t1 or left[0] == 0 else v + pitch[0]
+        return v, t[0], (left[0] - 1, left[1], left[2]), (t[0] + length[0], t[1], t[2])
+    if t[1] <= t[2]:
+        v = -1 if t[1] >= t1 or left[1] == 0 else v + pitch[1]
+        return v, t[1], (left[0], left[1] - 1, left[2]), (t[0], t[1] + length[1], t[2])
+    v = -1 if t[2] >= t1 or left[2] == 0 else v + pitch[2]
+    return v, t[2], (left[0], left[1], left[2] - 1), (t[0], t[1], t[2] + length[2])
+
+
+@njit(cache=True, inline="always")
+def _cell_bit(x, y, z):
+    """Bit of the half-size cell, of the eight that a voxel holds, in which a point lies (voxel units, >= 0)."""
+    return np.uint8(1 << (4 * (int(2 * x) & 1) + 2 * (int(2 * y) & 1) + (int(2 * z) & 1)))
 
 
 @njit(cache=True)
-def _carve_frame(depth, camera, pose, reach, start, stride, grid, footprint, free, hit, quality, stamp, frame_id):
+def _count_free(ox, oy, oz, ex, ey, ez, shape, free, passed, stamp, frame_id):
+    """Add 1 to every voxel that the segment o -> e (voxel units) crosses and that no ray of this frame hit.
+
+    In all of them, mark the half-size cells in which the segment is at one and at three quarters of its way through.
+    """
+    dx, dy, dz = ex - ox, ey - oy, ez - oz
+    v, t, t1, pitch, left, border, length = _enter(ox, oy, oz, ex, ey, ez, shape)
+    while v >= 0:
+        if stamp[np.uintp(v)] != frame_id:
+            free[np.uintp(v)] += np.int32(1)
+        here = v
+        t0 = t
+        v, t, left, border = _advance(v, t1, pitch, left, border, length)
+        if passed[np.uintp(here)] != 255:
+            out = min(t, t1)
+            a, b = 0.75 * t0 + 0.25 * out, 0.25 * t0 + 0.75 * out
+            bits = _cell_bit(ox + a * dx, oy + a * dy, oz + a * dz)
+            passed[np.uintp(here)] |= bits | _cell_bit(ox + b * dx, oy + b * dy, oz + b * dz)
+
+
+@njit(cache=True)
+def _carve_frame(depth, camera, pose, reach, start, stride, grid, footprint, out, stamp, frame_id):
     """One frame: mark the voxels that rays end in, then count the voxels that rays pass on their way there."""
     origin, inv_voxel = grid
     near, far = reach
+    free, hit, quality, passed, ended = out
     height, width = depth.shape
     nx, ny, nz = free.shape
     for i in range(start[0], height, stride):
@@ -142,27 +163,31 @@ def _carve_frame(depth, camera, pose, reach, start, stride, grid, footprint, fre
             x, y, z = math.floor(ex), math.floor(ey), math.floor(ez)
             if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
                 hit[x, y, z] += 1
+                ended[x, y, z] |= _cell_bit(ex, ey, ez)
                 stamp[x, y, z] = frame_id
                 # A hit voxel was seen, so its quality is never zero, even where no normal can be measured.
                 cosine = max(_incidence_cosine(depth, i, j, stride, camera), 0.1)
                 q = np.float32(cosine * min(1.0, footprint * camera[0] / d))
                 quality[x, y, z] = max(quality[x, y, z], q)
     ox, oy, oz = _pixel_end(0, 0, 0.0, camera, pose, origin, inv_voxel)
-    flat_free, flat_stamp = free.ravel(), stamp.ravel()
+    flat_free, flat_stamp, flat_passed = free.ravel(), stamp.ravel(), passed.ravel()
     for i in range(start[0], height, stride):
         for j in range(start[1], width, stride):
             d = depth[i, j]
             if d >= near and d > 0.0 and d < math.inf:
                 ex, ey, ez = _pixel_end(i, j, min(d, far), camera, pose, origin, inv_voxel)
-                _count_free(ox, oy, oz, ex, ey, ez, free.shape, flat_free, flat_stamp, frame_id)
+                _count_free(ox, oy, oz, ex, ey, ez, free.shape, flat_free, flat_passed, flat_stamp, frame_id)
 
 
 @njit(parallel=True, cache=True)
-def carve_frames(depths, cameras, poses, reaches, starts, stride, origin, inv_voxel, footprint, free, hit, quality):
+def carve_frames(
+    depths, cameras, poses, reaches, starts, stride, origin, inv_voxel, footprint, free, hit, quality, passed, ended
+):
     """Free and hit counts and best view quality of a stack of frames; frame f belongs to chunk f % CHUNKS.
 
     depths (F, H, W) f32; cameras (F, 4) fx fy cx cy; poses (F, 3, 4) camera -> world; reaches (F, 2) near, far;
-    starts (F, 2) first row and column; free, hit (CHUNKS, X, Y, Z) i32 and quality f32 are added to in place.
+    starts (F, 2) first row and column; free, hit (CHUNKS, X, Y, Z) i32, quality f32 and the half-size cells that
+    rays passed and ended in, u8 bits (`_cell_bit`), are added to in place.
     """
     stamp = np.full(free.shape, -1, np.int32)
     for c in prange(CHUNKS):
@@ -170,7 +195,7 @@ def carve_frames(depths, cameras, poses, reaches, starts, stride, origin, inv_vo
             camera = (cameras[f, 0], cameras[f, 1], cameras[f, 2], cameras[f, 3])
             _carve_frame(
                 depths[f], camera, poses[f], (reaches[f, 0], reaches[f, 1]), (starts[f, 0], starts[f, 1]), stride,
-                (origin, inv_voxel), footprint, free[c], hit[c], quality[c], stamp[c], f,
+                (origin, inv_voxel), footprint, (free[c], hit[c], quality[c], passed[c], ended[c]), stamp[c], f,
             )
 
 
@@ -299,40 +324,13 @@ def _mark_path(ox, oy, oz, ex, ey, ez, shape, blocked, stamp, frame_id, vain, se
 
     `stamp` holds 2 * frame + 1 where a reading passed in this frame and 2 * frame + 2 where only lost rays did.
     """
-    nx, ny, nz = shape
-    dx, dy, dz = ex - ox, ey - oy, ez - oz
-    t0, t1 = _clip(ox, dx, nx, 0.0, 1.0)
-    t0, t1 = _clip(oy, dy, ny, t0, t1)
-    t0, t1 = _clip(oz, dz, nz, t0, t1)
-    if t0 >= t1:
-        return
-    i, si, left_i, ti, gi = _start(ox, dx, nx, t0, ny * nz)
-    j, sj, left_j, tj, gj = _start(oy, dy, ny, t0, nz)
-    k, sk, left_k, tk, gk = _start(oz, dz, nz, t0, 1)
-    v = (i * ny + j) * nz + k
-    while True:
+    v, _, t1, pitch, left, border, length = _enter(ox, oy, oz, ex, ey, ez, shape)
+    while v >= 0:
         if vain and blocked[np.uintp(v)]:
             return
         if not vain or stamp[np.uintp(v)] != seen_id:
             stamp[np.uintp(v)] = frame_id
-        if ti <= tj and ti <= tk:
-            if ti >= t1 or left_i == 0:
-                return
-            left_i -= 1
-            v += si
-            ti += gi
-        elif tj <= tk:
-            if tj >= t1 or left_j == 0:
-                return
-            left_j -= 1
-            v += sj
-            tj += gj
-        else:
-            if tk >= t1 or left_k == 0:
-                return
-            left_k -= 1
-            v += sk
-            tk += gk
+        v, _, left, border = _advance(v, t1, pitch, left, border, length)
 
 
 @njit(cache=True)

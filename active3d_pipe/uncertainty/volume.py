@@ -106,6 +106,8 @@ def compute_volume(  # noqa: PLR0913  (the inputs of the stage, by name)
         "hit_evidence": evidence.hit,
         "view_quality": evidence.quality,
         "vain_looks": vain,
+        "cells_passed": evidence.passed,
+        "cells_hit": evidence.ended,
     }
     arrays = {name: np.ascontiguousarray(array, dtype=np.float32) for name, array in arrays.items()}
     return UncertaintyVolume(grid, round, arrays, fused.to_json(statistics, len(targets)))
@@ -154,7 +156,8 @@ def _check_grid(grid: VoxelGrid, previous: UncertaintyVolume | None) -> None:
 
 
 def _evidence_of(volume: UncertaintyVolume) -> RayEvidence:
-    return RayEvidence(volume["free_evidence"], volume["hit_evidence"], volume["view_quality"])
+    cells = (volume[name].astype(np.uint8) for name in ("cells_passed", "cells_hit"))
+    return RayEvidence(volume["free_evidence"], volume["hit_evidence"], volume["view_quality"], *cells)
 
 
 def _statistics_of(previous: UncertaintyVolume | None) -> fusion.FusionStatistics:

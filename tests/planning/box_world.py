@@ -7,10 +7,13 @@ import numpy as np
 from active3d_pipe.geometry import se3
 from active3d_pipe.geometry.voxel_traversal import carve, trace_depth
 from active3d_pipe.information.entropy import bernoulli_entropy
-from active3d_pipe.structures import Camera, UncertaintyVolume, VoxelGrid
+from active3d_pipe.structures import Camera, Frame, UncertaintyVolume, VoxelGrid
+from active3d_pipe.uncertainty.carving import integrate_depth
+from active3d_pipe.uncertainty.config import UncertaintySettings
 
 # Map voxels are 0.1 m; the world is built from voxels half as large, off the map's grid by a quarter.
 VOXEL, FINE = 0.1, 0.05
+EVERY_PIXEL = UncertaintySettings(ray_stride=1)
 
 
 @dataclass
@@ -24,17 +27,24 @@ class BoxWorld:
     free: np.ndarray = field(init=False)
     hit: np.ndarray = field(init=False)
     quality: np.ndarray = field(init=False)
+    passed: np.ndarray = field(init=False)
+    ended: np.ndarray = field(init=False)
     seen: np.ndarray = field(init=False)
 
     def __post_init__(self):
         self.free, self.hit = np.zeros(self.grid.shape, np.int32), np.zeros(self.grid.shape, np.int32)
         self.quality = np.zeros(self.grid.shape, np.float32)
+        self.passed, self.ended = np.zeros(self.grid.shape, np.uint8), np.zeros(self.grid.shape, np.uint8)
         self.seen = np.zeros(self.fine.shape, bool)
 
     def capture(self, T, *, max_range_m=10.0):
         """One frame at a true pose; `seen` marks true surface voxels that it shows."""
         depth = trace_depth(self.solid, self.fine, T, self.camera, max_range_m=max_range_m)
         carve(self.grid, T, self.camera, depth, counts=(self.free, self.hit))
+        blank = np.zeros((*depth.shape, 3), np.uint8)
+        new = integrate_depth(self.grid, [Frame(0, 0, self.camera, T, blank, depth)], EVERY_PIXEL)
+        self.passed |= new.passed
+        self.ended |= new.ended
         rows, columns = np.nonzero(depth)
         rays = np.stack([
             (columns + 0.5 - self.camera.cx) / self.camera.fx, (rows + 0.5 - self.camera.cy) / self.camera.fy,
@@ -70,6 +80,7 @@ class BoxWorld:
         arrays.update(
             u_final=unseen, occupancy=occupancy, entropy_imp=entropy, entropy_exp=entropy, entropy=entropy,
             sdf=sdf, free_evidence=free, hit_evidence=hit, view_quality=self.quality,
+            cells_passed=self.passed.astype(np.float32), cells_hit=self.ended.astype(np.float32),
         )
         return UncertaintyVolume(self.grid, round_index, arrays)
 

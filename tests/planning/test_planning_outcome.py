@@ -6,13 +6,12 @@ import pytest
 from scipy.stats import spearmanr
 
 from active3d_pipe.geometry import se3
-from active3d_pipe.geometry.reference_traversal import traverse
 from active3d_pipe.geometry.voxel_traversal import fan_stride, ray_fan
 from active3d_pipe.information.gain import OPEN, SURFACE
 from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.decide import bootstrap_decision, decide
 from active3d_pipe.planning.outcome import Account, expected_along
-from active3d_pipe.planning.reference_reward import surface_share
+from active3d_pipe.planning.reference_reward import sight, surface_share
 from active3d_pipe.planning.reward import build_reward_field
 from active3d_pipe.structures import Decision
 from active3d_pipe.structures.motion import MotionSettings
@@ -24,14 +23,13 @@ def reference_path_gain(field, poses, camera):
     """Every voxel once, at the best of its looks, with Python loops."""
     grid = field.grid
     fan = ray_fan(camera, 2 * fan_stride(camera, grid.voxel_size, field.max_range_m))[2]
-    opaque = field.opaque.reshape(grid.shape).astype(bool)
     best = np.zeros(grid.size)
     for T in poses:
         origin = (T[:3, 3] - grid.origin) / grid.voxel_size
         for ray in fan:
             direction = T[:3, :3] @ ray
             passed = 1.0
-            for ijk in traverse(opaque, origin, direction, field.max_range_m / grid.voxel_size):
+            for ijk in sight(field, origin, direction)[0]:
                 v = int(np.ravel_multi_index(ijk, grid.shape))
                 if field.kind[v] == OPEN:
                     best[v] = max(best[v], passed)

@@ -6,6 +6,7 @@ from active3d_pipe.geometry import se3
 from active3d_pipe.planning import kernels_targets
 from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.free_space import build_free_space
+from active3d_pipe.planning.reference_reward import cell_bit
 from active3d_pipe.planning.reward import build_reward_field
 from active3d_pipe.planning.targets import target_positions
 from active3d_pipe.structures.motion import MotionSettings
@@ -13,23 +14,33 @@ from active3d_pipe.structures.motion import MotionSettings
 SETTINGS, MOTION = PlanningSettings(), MotionSettings()
 
 
-def reference_viewpoints(targets, places, opaque, through, normal, shape, nearest, farthest, falloff, steps, fixed):
+def reference_viewpoints(
+    targets, bits, places, opaque, clear, through, normal, shape, nearest, farthest, falloff, steps, fixed
+):
     """The obvious loop."""
     out = []
-    for t in targets:
+    for t, bit in zip(targets, bits, strict=True):
+        cell = int(np.log2(bit)) if bit else None
+        eye = t + (0.5 if cell is None else 0.25 + 0.5 * np.array([cell >> 2 & 1, cell >> 1 & 1, cell & 1]))
         looks = np.full(len(places), -1.0)
         for n, p in enumerate(places):
-            d = (p - t).astype(float)
+            d = p + 0.5 - eye
             distance = np.linalg.norm(d)
             if not nearest <= distance <= farthest:
                 continue
-            m = int(np.ceil(distance))
-            cells = [tuple(np.floor(t + i / m * d + 0.5).astype(int)) for i in range(1, m)]
-            cells = [c for c in dict.fromkeys(cells) if c != tuple(t)]
-            ids = [np.ravel_multi_index(c, shape) for c in cells]
-            passed = np.prod([0.0 if opaque[v] else through[v] for v in ids])
+            m = int(np.ceil(distance)) * (1 if cell is None else 2)
+            passed, crossed = 1.0, set()
+            for point in (eye + i / m * d for i in range(1, m)):
+                ijk = tuple(np.floor(point).astype(int))
+                v = np.ravel_multi_index(ijk, shape)
+                if opaque[v]:
+                    own = ijk == tuple(t) and (cell is None or cell_bit(point) == bit)
+                    passed *= own or bool(clear[v] & cell_bit(point))
+                elif ijk != tuple(t) and v not in crossed:
+                    passed *= through[v]
+                    crossed.add(v)
             side = normal[np.ravel_multi_index(tuple(t), shape)].astype(float)
-            cos = side @ d / (np.linalg.norm(side) * distance) if np.linalg.norm(side) > 1 else 1.0
+            cos = side @ d / (np.linalg.norm(side) * distance) if np.linalg.norm(side) > 1 and not bit else 1.0
             if passed >= 0.05:
                 looks[n] = passed * min(1, falloff / distance) * cos
         seen = looks > 0.05
@@ -47,9 +58,12 @@ def test_best_viewpoints_equal_the_reference():
     places = np.stack([rng.integers(0, n, 150) for n in shape], -1).astype(np.int32)
     targets = np.stack([rng.integers(0, n, 20) for n in shape], -1).astype(np.int32)
     steps = rng.uniform(0, 40, len(places)).astype(np.float32)
+    clear = np.where(opaque, rng.integers(0, 256, opaque.size), 255).astype(np.uint8)
+    bits = np.where(rng.random(len(targets)) < 0.5, 0, 1 << rng.integers(0, 8, len(targets))).astype(np.uint8)
+    opaque[np.ravel_multi_index(tuple(targets[bits > 0].T), shape)] = 1
     args = (np.float32(1.5), np.float32(9), np.float32(4), steps, np.float32(10))
-    got = kernels_targets.best_viewpoints(targets, places, opaque, through, normal, shape, *args)
-    want = reference_viewpoints(targets, places, opaque, through, normal, shape, *args)
+    got = kernels_targets.best_viewpoints(targets, bits, places, opaque, clear, through, normal, shape, *args)
+    want = reference_viewpoints(targets, bits, places, opaque, clear, through, normal, shape, *args)
     assert (got >= 0).all(axis=1).sum() > 10
     for (a, b), (looks, rates) in zip(got, want, strict=True):
         for chosen, values in ((a, looks), (b, rates)):

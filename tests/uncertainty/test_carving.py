@@ -149,3 +149,21 @@ def test_quality_is_incidence_times_resolution(angle, distance):
     assert middle == pytest.approx(expected, rel=0.03)
     assert ((got.quality > 0) == (got.hit > 0)).all()
     assert got.quality.max() <= 1
+
+
+def test_cells_tell_what_part_of_a_voxel_was_passed_and_hit():
+    """Rays towards a wall in the middle of voxels pass their near halves, end in their far halves, and no more."""
+    grid = VoxelGrid(np.zeros(3), 0.2, (10, 10, 10))
+    camera = Camera.from_fov(64, 64, 60)
+    T = se3.pose_from_yaw_pitch(np.array([0.31, 1.01, 1.01]), 0.0, 0.0)
+    f = Frame(0, 0, camera, T, np.zeros((64, 64, 3), np.uint8), np.full((64, 64), 1.24, np.float32))
+    got = integrate_depth(grid, [f], EVERY_PIXEL)
+    wall = got.hit > 0
+    assert wall.sum() > 20
+    assert set(np.argwhere(wall)[:, 0]) == {7}
+    lower, upper = np.uint8(0b00001111), np.uint8(0b11110000)
+    assert (got.ended[wall] & lower == 0).all()
+    assert (got.ended[7, 4:6, 4:6] == upper).all()
+    assert (got.passed[7, 4:6, 4:6] & lower == lower).all()
+    assert not got.ended[~wall].any()
+    assert not got.passed[8:].any()

@@ -24,7 +24,8 @@ COUNTS = arrays(np.float32, SHAPE, elements=st.integers(0, 100_000).map(float))
 
 def evidence(free, hit):
     free, hit = np.broadcast_arrays(np.asarray(free, np.float32), np.asarray(hit, np.float32))
-    return RayEvidence(free, hit, np.zeros_like(free))
+    cells = np.zeros(free.shape, np.uint8)
+    return RayEvidence(free, hit, np.zeros_like(free), cells, cells)
 
 
 @settings(max_examples=60, deadline=None)
