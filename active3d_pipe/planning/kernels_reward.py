@@ -31,7 +31,8 @@ def sphere_gain(
     adds up to the reward of the view made of them. An open cell has a quarter of a voxel's face.
 
     positions (P, 3), directions (M, 3) world, solid_angles (M,) sr, `skip` (flat uint8) the Chebyshev distance to
-    the nearest voxel that is not seen free, `through` the transmittance of a voxel. Returns (P, M) float32.
+    the nearest voxel that is not seen free or that a ray ended in, `through` the transmittance of a voxel. Returns
+    (P, M) float32.
     """
     nx, ny, nz = shape
     out = np.zeros((positions.shape[0], directions.shape[0]), np.float32)
@@ -79,14 +80,15 @@ def sphere_gain(
 
 @njit(parallel=True, fastmath=True, cache=True)
 def frustum_gain(
-    origins, rotations, fan, opaque, kind, value, log_through, surface_value, quality, normal, clear, open_bits,
+    origins, rotations, fan, opaque, skip, kind, value, log_through, surface_value, quality, normal, clear, open_bits,
     cell_value, gain_imp, gain_exp, shape, voxel_size, max_range, enough, quality_range,
 ):
     """Exact sums over the unique visible voxels of every candidate view.
 
     origins (C, 3), rotations (C, 3, 3) camera to world, fan (M, 3) unit camera rays. A voxel counts at the first
     ray of the fan that crosses it, with that ray's transmittance; stamps keep it from counting twice, and so for open
-    cells. Returns (C, 6) float64: reward, surface part, gain_imp, gain_exp, number visible, number open.
+    cells. Returns (C, 6) float64: reward, surface part, gain_imp, gain_exp, number visible (seen free ones do not
+    count), number open.
     """
     size = shape[0] * shape[1] * shape[2]
     count = origins.shape[0]
@@ -99,11 +101,13 @@ def frustum_gain(
         for c in range(chunk, count, chunks):
             for r in range(fan.shape[0]):
                 n, bit, (dx, dy, dz), piece = cast(
-                    opaque, clear, origins[c], rotations[c], fan[r], voxel_size, max_range, shape, ids
+                    opaque, clear, skip, origins[c], rotations[c], fan[r], voxel_size, max_range, shape, ids
                 )
                 transmittance, depth = ONE, ZERO
                 for m in range(n):
                     v = ids[m]
+                    if kind[v] == 0:
+                        continue
                     if stamp[v] != c:
                         stamp[v] = c
                         cells[v] = 0
@@ -142,8 +146,8 @@ def frustum_gain(
 
 @njit(parallel=True, fastmath=True, cache=True)
 def path_gain(
-    origins, rotations, fan, opaque, kind, log_through, quality, normal, clear, gain_imp, gain_exp, shape, voxel_size,
-    max_range, enough, quality_range,
+    origins, rotations, fan, opaque, skip, kind, log_through, quality, normal, clear, gain_imp, gain_exp, shape,
+    voxel_size, max_range, enough, quality_range,
 ):
     """(gain_imp, gain_exp) of all poses together, float64: every voxel once, at the best of its looks.
 
@@ -156,7 +160,7 @@ def path_gain(
         for c in range(chunk, origins.shape[0], chunks):
             for r in range(fan.shape[0]):
                 n, _, (dx, dy, dz), piece = cast(
-                    opaque, clear, origins[c], rotations[c], fan[r], voxel_size, max_range, shape, ids
+                    opaque, clear, skip, origins[c], rotations[c], fan[r], voxel_size, max_range, shape, ids
                 )
                 transmittance, depth = ONE, ZERO
                 for m in range(n):
@@ -183,11 +187,11 @@ def path_gain(
 
 
 @njit(fastmath=True, cache=True)
-def mark_seen(origin, R, fan, opaque, clear, shape, voxel_size, max_range, seen, cells):
-    """seen = 1 in every voxel that a view meets, cells |= bits of the cells that its rays end in; flat."""
+def mark_seen(origin, R, fan, opaque, skip, clear, shape, voxel_size, max_range, seen, cells):
+    """seen = 1 in every voxel of interest that a view meets, cells |= bits of the cells that its rays end in; flat."""
     ids = np.empty(shape[0] + shape[1] + shape[2] + 3, np.int32)
     for r in range(fan.shape[0]):
-        n, bit, _, _ = cast(opaque, clear, origin, R, fan[r], voxel_size, max_range, shape, ids)
+        n, bit, _, _ = cast(opaque, clear, skip, origin, R, fan[r], voxel_size, max_range, shape, ids)
         for m in range(n):
             seen[ids[m]] = 1
         if n > 0:
@@ -196,8 +200,8 @@ def mark_seen(origin, R, fan, opaque, clear, shape, voxel_size, max_range, seen,
 
 @njit(parallel=True, fastmath=True, cache=True)
 def count_looks(
-    origins, rotations, weights, fan, stops, kind, quality, normal, clear, open_bits, shape, voxel_size, max_range,
-    enough, quality_range,
+    origins, rotations, weights, fan, stops, skip, kind, quality, normal, clear, open_bits, shape, voxel_size,
+    max_range, enough, quality_range,
 ):
     """How many of the past views looked at each voxel, and at open cells of it, in vain; (2, size) float32.
 
@@ -215,7 +219,7 @@ def count_looks(
         for c in range(chunk, count, chunks):
             for r in range(fan.shape[0]):
                 n, bit, (dx, dy, dz), _ = cast(
-                    stops, clear, origins[c], rotations[c], fan[r], voxel_size, max_range, shape, ids
+                    stops, clear, skip, origins[c], rotations[c], fan[r], voxel_size, max_range, shape, ids
                 )
                 for m in range(n):
                     v = ids[m]

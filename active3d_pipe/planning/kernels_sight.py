@@ -13,6 +13,8 @@ from numba import njit, prange
 from active3d_pipe.geometry.kernels_traversal import FAR, entry_parameter
 
 ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
+# Shorter jumps cost more than the steps they save.
+LEAST_JUMP = 3
 
 
 @njit(fastmath=True, cache=True)
@@ -49,12 +51,13 @@ def blocked_cell(clear_bits, px, py, pz, dx, dy, dz, t0, t1):
 
 
 @njit(fastmath=True, cache=True)
-def walk_sight(stops, clear, px, py, pz, dx, dy, dz, t_end, shape, ids):
-    """Voxels that a ray crosses, in order, up to t_end or the first in which it ends; (how many, bit of that cell).
+def walk_sight(stops, clear, skip, voxel_size, px, py, pz, dx, dy, dz, t_end, shape, ids):
+    """Voxels of interest that a ray crosses, in order, up to t_end or the first in which it ends.
 
-    A ray ends in a voxel of `stops` (flat uint8) unless all that it crosses of it is clear; such voxels are left out
-    of `ids` (int32 buffer of at least nx + ny + nz + 3). The bit is 0 when the ray ends nowhere. Traversal after
-    Amanatides and Woo (1987).
+    Returns (how many, bit of the cell in which it ends, 0 = nowhere). `skip` (flat uint8) is the Chebyshev distance of
+    a voxel to the nearest one of interest, 0 for those themselves; the others are jumped over. A ray ends in a voxel
+    of `stops` (flat uint8) unless all that it crosses of it is clear; such voxels are left out of `ids` (int32 buffer
+    of at least nx + ny + nz + 3). Traversal after Amanatides and Woo (1987).
     """
     nx, ny, nz = shape
     t = entry_parameter(px, py, pz, dx, dy, dz, nx, ny, nz)
@@ -68,15 +71,32 @@ def walk_sight(stops, clear, px, py, pz, dx, dy, dz, t_end, shape, ids):
     ex = ONE / abs(dx) if abs(dx) > tiny else FAR
     ey = ONE / abs(dy) if abs(dy) > tiny else FAR
     ez = ONE / abs(dz) if abs(dz) > tiny else FAR
+    sx, sy, sz = np.float32(si) * ex, np.float32(sj) * ey, np.float32(sk) * ez
     tx = (np.float32(i + (1 if si > 0 else 0)) - px) / dx if abs(dx) > tiny else FAR
     ty = (np.float32(j + (1 if sj > 0 else 0)) - py) / dy if abs(dy) > tiny else FAR
     tz = (np.float32(k + (1 if sk > 0 else 0)) - pz) / dz if abs(dz) > tiny else FAR
     n = 0
     while True:
         v = (i * ny + j) * nz + k
+        if skip[v] > LEAST_JUMP:
+            # So far no voxel of interest can be: from any point of this one, and not farther than to the next but one.
+            t += np.float32(skip[v] - 1) * voxel_size
+            if t > t_end:
+                return n, np.uint8(0)
+            i, j, k = (
+                np.int32(np.floor(px + t * dx)), np.int32(np.floor(py + t * dy)), np.int32(np.floor(pz + t * dz))
+            )
+            if i < 0 or j < 0 or k < 0 or i >= nx or j >= ny or k >= nz:
+                return n, np.uint8(0)
+            tx = (np.float32(i + (1 if si > 0 else 0)) - px) * sx if ex < FAR else FAR
+            ty = (np.float32(j + (1 if sj > 0 else 0)) - py) * sy if ey < FAR else FAR
+            tz = (np.float32(k + (1 if sk > 0 else 0)) - pz) * sz if ez < FAR else FAR
+            continue
         t_out = min(tx, min(ty, tz))
         ids[n] = v
-        if stops[v] != 0:
+        if skip[v] != 0:
+            pass
+        elif stops[v] != 0:
             bit = blocked_cell(clear[v], px, py, pz, dx, dy, dz, t, t_out)
             if bit:
                 return n + 1, bit
@@ -103,7 +123,7 @@ def walk_sight(stops, clear, px, py, pz, dx, dy, dz, t_end, shape, ids):
 
 
 @njit(fastmath=True, cache=True)
-def cast(stops, clear, origin, R, ray, voxel_size, t_end, shape, ids):
+def cast(stops, clear, skip, origin, R, ray, voxel_size, t_end, shape, ids):
     """`walk_sight` of a camera ray (unit): (how many voxels, bit of the last cell, direction, share of a voxel).
 
     The last is the length of an average piece of the ray in a voxel, relative to the voxel: a slanted ray crosses
@@ -113,7 +133,9 @@ def cast(stops, clear, origin, R, ray, voxel_size, t_end, shape, ids):
     dx = (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z) / voxel_size
     dy = (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z) / voxel_size
     dz = (R[2, 0] * x + R[2, 1] * y + R[2, 2] * z) / voxel_size
-    n, bit = walk_sight(stops, clear, origin[0], origin[1], origin[2], dx, dy, dz, t_end, shape, ids)
+    n, bit = walk_sight(
+        stops, clear, skip, voxel_size, origin[0], origin[1], origin[2], dx, dy, dz, t_end, shape, ids
+    )
     return n, bit, (dx, dy, dz), ONE / (voxel_size * (abs(dx) + abs(dy) + abs(dz)))
 
 

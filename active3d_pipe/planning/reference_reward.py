@@ -70,7 +70,7 @@ def exact_terms(field: RewardField, T_world_camera: np.ndarray, fan: np.ndarray)
                 surface += transmittance * field.cell_value[v] * cell_share(field, distance)
             if v not in seen:
                 seen.add(v)
-                visible += transmittance
+                visible += transmittance * (field.kind[v] != FREE)
                 if field.kind[v] == OPEN:
                     reward += transmittance * field.value[v]
                     imp += transmittance * field.gain_imp[v]

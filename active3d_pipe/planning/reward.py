@@ -55,7 +55,7 @@ class RewardField:
         origin, rotation = (a[0] for a in _in_voxels(grid, T_world_camera[None]))
         fan = ray_fan(camera, fan_stride(camera, grid.voxel_size, self.max_range_m))[2].astype(np.float32)
         kernels.mark_seen(
-            origin, rotation, fan, self.opaque, self.clear, grid.shape, np.float32(grid.voxel_size),
+            origin, rotation, fan, self.opaque, self.skip, self.clear, grid.shape, np.float32(grid.voxel_size),
             np.float32(self.max_range_m), seen, cells,
         )
         changed = {name: getattr(self, name).copy() for name in ("value", "surface_value", "gain_imp", "gain_exp")}
@@ -79,17 +79,18 @@ def build_reward_field(
     normal = np.zeros((*grid.shape, 3), np.int8)
     kernels_sight.surface_normals(kind, normal)
     clear, open_bits = _cells(volume, kind)
-    skip = kernels_distance.distance_transform((kind != FREE).view(np.uint8), LONGEST_SKIP, True).astype(np.uint8)
+    of_interest = ((kind != FREE) | (volume["hit_evidence"] > 0)).view(np.uint8)
+    skip = kernels_distance.distance_transform(of_interest, LONGEST_SKIP, True).astype(np.uint8).ravel()
     opaque = (kind == SURFACE).view(np.uint8).ravel()
     quality = np.ascontiguousarray(volume["view_quality"]).ravel()
     cells = clear.ravel(), open_bits.ravel()
-    looks = _looks(volume, kind.ravel(), quality, normal.reshape(-1, 3), cells, walked_poses, camera, settings)
+    looks = _looks(volume, (skip, kind.ravel(), quality, normal.reshape(-1, 3)), cells, walked_poses, camera, settings)
     credit, cell_credit = np.float32(settings.credit_factor) ** looks
     # An eighth of what an open voxel is worth that may turn out either way, times the weight.
     whole = settings.cell_weight * (information.alpha + information.beta) / 16
     volumes = information_volumes(volume.arrays, information, enough, credit.reshape(grid.shape))
     return RewardField(
-        grid, information.quality_range_m(camera.fx), enough, reach, kind.ravel(), opaque, skip.ravel(),
+        grid, information.quality_range_m(camera.fx), enough, reach, kind.ravel(), opaque, skip,
         volumes.value.ravel(), through, volumes.surface_value.ravel(), quality, normal.reshape(-1, 3),
         *cells, np.float32(whole) * cell_credit,
         volumes.gain_imp.ravel(), volumes.gain_exp.ravel(),
@@ -161,16 +162,17 @@ def repeated_poses(poses: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarra
 
 def _looks(
     volume: UncertaintyVolume,
-    kind: np.ndarray,
-    quality: np.ndarray,
-    normal: np.ndarray,
+    seen: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
     cells: tuple[np.ndarray, np.ndarray],
     poses: np.ndarray,
     camera: Camera,
     settings: PlanningSettings,
 ) -> np.ndarray:
-    """How many past views promised something of each voxel, of its open cells, that did not come true, (2, size)."""
-    grid = volume.grid
+    """How many past views promised something of each voxel, of its open cells, that did not come true, (2, size).
+
+    seen: `skip`, `kind`, `quality` and `normal` of a `RewardField`.
+    """
+    grid, kind = volume.grid, seen[1]
     if len(poses) == 0 or settings.credit_views == 0:
         return np.zeros((2, grid.size), np.float32)
     reach = min(settings.max_range_m, camera.far)
@@ -179,7 +181,7 @@ def _looks(
     stops = ((kind == SURFACE) | (volume["hit_evidence"].ravel() > 0)).view(np.uint8)
     chosen, looks = repeated_poses(poses, settings.credit_views)
     return kernels.count_looks(
-        *_in_voxels(grid, poses[chosen]), looks, fan, stops, kind, quality, normal, *cells, grid.shape,
+        *_in_voxels(grid, poses[chosen]), looks, fan, stops, *seen, *cells, grid.shape,
         np.float32(grid.voxel_size), np.float32(reach),
         np.float32(settings.information.enough_quality(camera.fx)),
         np.float32(settings.information.quality_range_m(camera.fx)),
@@ -209,7 +211,7 @@ def exact_terms(
     stride = ray_stride or fan_stride(camera, grid.voxel_size, field.max_range_m)
     sums = kernels.frustum_gain(
         *_in_voxels(grid, poses), ray_fan(camera, stride)[2].astype(np.float32),
-        field.opaque, field.kind, field.value, np.log(np.maximum(field.through, np.float32(1e-6))),
+        field.opaque, field.skip, field.kind, field.value, np.log(np.maximum(field.through, np.float32(1e-6))),
         field.surface_value, field.quality, field.normal, field.clear, field.open_bits, field.cell_value,
         field.gain_imp, field.gain_exp, grid.shape, np.float32(grid.voxel_size), np.float32(field.max_range_m),
         np.float32(field.enough_quality), np.float32(field.quality_range_m),
