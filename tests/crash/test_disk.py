@@ -67,7 +67,7 @@ def test_disk_full(tmp_path: Path, small_disk: Path) -> None:
 def test_file_size_limit(tmp_path: Path) -> None:
     whole, path = tmp_path / "whole", tmp_path / "run"
     assert _run(tmp_path, whole).returncode == 0
-    failed = _run(tmp_path, path, file_limit=20_000)  # the frames of round 0 are larger
+    failed = _run(tmp_path, path, file_limit=40_000)  # the configuration is smaller, the frames of round 0 are larger
     assert failed.returncode == 74
     assert "Traceback" not in failed.stderr
     assert "cannot write" in failed.stderr

@@ -35,7 +35,7 @@ def paint(points):
 def view_of_ball(direction, size=240):
     """Frame of the painted ball from 1 m away along `direction`, exact depth; black where there is nothing."""
     camera = Camera.from_fov(size, size, 60)
-    T = se3.look_at(CENTRE + np.asarray(direction, float), CENTRE)
+    T = se3.look_at(CENTRE + np.asarray(direction, float) / np.linalg.norm(direction), CENTRE)
     rays = projection.pixel_rays(camera)
     a = (rays**2).sum(axis=-1)
     disc = 1 - a * (1 - RADIUS**2)
