@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from active3d_pipe.geometry.sampling import spread
 from active3d_pipe.pipeline.stage import NodeId, Stage, StageContext
 from stages import shared
 
@@ -16,7 +17,7 @@ CURVE_ROUNDS = 16  # rounds whose surfaces are measured for the curves over step
 
 
 def _inputs(last_round: int) -> tuple[NodeId, ...]:
-    surfaces = tuple(NodeId("uncertainty", k) for k in shared.spread(range(last_round + 1), CURVE_ROUNDS))
+    surfaces = tuple(NodeId("uncertainty", k) for k in spread(range(last_round + 1), CURVE_ROUNDS))
     return (*shared.captures(last_round), *surfaces, NodeId("export"))
 
 
@@ -117,7 +118,7 @@ def _view_sets(simulator: Any, frames: list, settings: Any) -> dict[str, list]:
     return {
         "heldout": [simulator.render(T, step=i) for i, T in enumerate(held_out)],
         "circle": [simulator.render(T, step=i) for i, T in enumerate(circle)],
-        "train": shared.spread(frames, settings.train_views) if settings.train_views else [],
+        "train": spread(frames, settings.train_views) if settings.train_views else [],
     }
 
 

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from active3d_pipe.geometry.sampling import spread
 from active3d_pipe.pipeline.stage import NodeId, Stage, StageContext
 from stages import shared
 
@@ -46,7 +47,7 @@ def _run(context: StageContext) -> None:
     ]
     sliced = {
         k: volumes.read_volume(context.input("uncertainty", k) / shared.VOLUME_NAME)
-        for k in shared.spread(rounds, SLICED_ROUNDS)
+        for k in spread(rounds, SLICED_ROUNDS)
     }
     last = sliced[context.last_round]
     fusion = [_fusion_document(context.input("uncertainty", k)) for k in rounds]

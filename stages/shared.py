@@ -3,10 +3,11 @@
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from active3d_pipe.geometry.sampling import spread
 from active3d_pipe.pipeline.stage import NodeId
 
 if TYPE_CHECKING:
@@ -14,7 +15,6 @@ if TYPE_CHECKING:
     from active3d_pipe.sim.simulator import Simulator
     from active3d_pipe.structures import Camera, Frame
 
-T = TypeVar("T")
 LOG_NAME, CAPTURE_NAME, DECISION_NAME = "frames.mcap", "capture.json", "decision.json"
 VOLUME_NAME, SURFACE_NAME = "volume.zarr", "surface.ply"
 CACHE_BYTES = 1 << 29  # decoded frames kept in memory between the stages of one process
@@ -136,14 +136,6 @@ def _block_centres(depth: np.ndarray, stride: int) -> np.ndarray:
     return np.where(smooth, mean, last).astype(np.float32)
 
 
-def spread(items: "Sequence[T]", most: int) -> "list[T]":
-    """At most `most` items, evenly spread over the sequence, the last one included."""
-    if len(items) <= most:
-        return list(items)
-    chosen = np.unique(np.linspace(0, len(items) - 1, most).round().astype(int))
-    return [items[int(i)] for i in chosen]
-
-
 def walked_poses(inputs: Mapping[NodeId, Path], last_round: int) -> np.ndarray:
     """(M, 4, 4) poses of every captured frame, in order."""
     return np.concatenate([np.array(read_capture(inputs[node])["poses"]) for node in captures(last_round)])
@@ -158,7 +150,9 @@ def save_map(folder: Path, hybrid: "HybridMap", *, to_train: bool = True) -> Non
     write_tensors(folder / "gaussians.safetensors", state["gaussians"])
     write_json(folder / "keyframes.json", [k.to_json() for k in hybrid.keyframes])
     _newest_map.clear()
-    if to_train:
+    if not to_train:
+        _previous_map.clear()  # the last map: nothing is mapped after it
+    else:
         write_tensors(folder / "optimiser.safetensors", state["optimiser"])
         _newest_map.append((_map_identity(folder), hybrid))
 

@@ -10,6 +10,7 @@ import numpy as np
 from active3d_pipe.evaluation import image_metrics
 from active3d_pipe.evaluation.lpips import Lpips
 from active3d_pipe.geometry import se3
+from active3d_pipe.geometry.sampling import spread
 from active3d_pipe.structures import Camera, Frame
 
 Render = Callable[[Camera, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
@@ -99,10 +100,7 @@ def summarise(rows: list[dict[str, Any]]) -> dict[str, dict[str, float | None]]:
 def pick_examples(rows: list[dict[str, Any]], count: int) -> list[int]:
     """Views to show: spread evenly from the worst PSNR to the best, so that a report does not flatter."""
     ranked = sorted((row["psnr"], row["view"]) for row in rows if row.get("psnr") is not None)
-    if not ranked or count < 1:
-        return []
-    places = np.unique(np.linspace(0, len(ranked) - 1, min(count, len(ranked))).round().astype(int))
-    return [ranked[p][1] for p in places]
+    return [view for _, view in spread(ranked, max(count, 0))]
 
 
 def view_images(render: Render, frame: Frame, index: int) -> ViewImages:

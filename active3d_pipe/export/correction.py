@@ -8,6 +8,7 @@ from scipy.ndimage import binary_dilation
 from active3d_pipe.export import kernels_correction as kernels
 from active3d_pipe.export.config import MeshSettings
 from active3d_pipe.geometry import projection
+from active3d_pipe.geometry.sampling import spread
 from active3d_pipe.structures import Frame, VoxelGrid
 
 STRIDE = 4  # of the pixels, every how many are compared with the field
@@ -34,11 +35,10 @@ def corrected_sdf(
     """
     if settings.dispute_m <= 0 or not frames:
         return query_sdf
-    grid, marks, loudest = _disputed(query_sdf, low, high, frames, settings)
+    grid, marks, fused = _disputed(query_sdf, low, high, frames, settings)
     if not marks.any():
         return query_sdf
     origin, inv_cell = grid.origin.astype(np.float32), np.float32(1 / grid.voxel_size)
-    fused = [frames[i] for i in loudest]
     poses = np.stack([f.T_world_camera for f in fused]).astype(np.float32)
     lenses = np.array([[f.camera.fx, f.camera.fy, f.camera.cx, f.camera.cy] for f in fused], np.float32)
     views = (
@@ -66,15 +66,15 @@ def corrected_sdf(
 def _disputed(
     query_sdf: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high: np.ndarray, frames: Sequence[Frame],
     settings: MeshSettings,
-) -> tuple[VoxelGrid, np.ndarray, list[int]]:
+) -> tuple[VoxelGrid, np.ndarray, list[Frame]]:
     """Grid, the cells (X, Y, Z) bool in and beside which readings contradict, and the frames that do so most."""
     grid = VoxelGrid.from_bounds(low, high, 2 * settings.voxel_size_m)
     origin, inv_cell = grid.origin.astype(np.float32), np.float32(1 / grid.voxel_size)
     sums, counts = np.zeros(grid.shape, np.float32), np.zeros(grid.shape, np.int32)
-    compared = np.unique(np.linspace(0, len(frames) - 1, min(MOST_FRAMES, len(frames))).round().astype(int)).tolist()
+    compared = spread(frames, MOST_FRAMES)
     against: list[int] = []
-    for index in compared:
-        points = _readings(frames[index])
+    for frame in compared:
+        points = _readings(frame)
         values = query_sdf(points) if len(points) else np.zeros(0, np.float32)
         kernels.add_readings(points, values, origin, inv_cell, sums, counts)
         against.append(int((np.abs(values) > settings.dispute_m).sum()))
@@ -83,7 +83,7 @@ def _disputed(
     if marks.any():
         marks = binary_dilation(marks, structure=np.ones((3, 3, 3), bool))
     order = np.argsort(-np.array(against), kind="stable")[:MOST_FUSED]
-    return grid, marks, sorted(compared[int(i)] for i in order)
+    return grid, marks, [compared[int(i)] for i in np.sort(order)]
 
 
 def _readings(frame: Frame) -> np.ndarray:

@@ -1,28 +1,13 @@
 """The mesh that a run hands over: extracted near what was read, culled by what was seen, coloured from the views."""
 
 from collections.abc import Sequence
-from typing import Protocol
-
-import numpy as np
 
 from active3d_pipe.export.config import MeshSettings
 from active3d_pipe.export.correction import corrected_sdf
 from active3d_pipe.export.isosurface import drop_small_components, extract_mesh
 from active3d_pipe.export.view_fusion import colour_from_views, colour_mesh, cull_unseen, near_readings
+from active3d_pipe.field.surface_view import Surface
 from active3d_pipe.structures import Frame, TriangleMesh
-
-
-class Surface(Protocol):
-    """What the mesh is made of: an SDF with colour over the box [low, high], world, m."""
-
-    low: np.ndarray
-    high: np.ndarray
-
-    def query_sdf(self, points: np.ndarray) -> np.ndarray:
-        """(N,) SDF, m, at world points (N, 3)."""
-
-    def query_color(self, points: np.ndarray) -> np.ndarray:
-        """(N, 3) colour in 0..1 at world points (N, 3)."""
 
 
 def final_mesh(field: Surface, frames: Sequence[Frame], settings: MeshSettings) -> TriangleMesh:

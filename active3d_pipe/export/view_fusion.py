@@ -8,6 +8,7 @@ from scipy.ndimage import binary_dilation
 from active3d_pipe.export import kernels_views as kernels
 from active3d_pipe.export.config import MeshSettings
 from active3d_pipe.export.isosurface import QuerySdf, keep_faces
+from active3d_pipe.geometry.sampling import spread
 from active3d_pipe.structures import Frame, TriangleMesh, VoxelGrid
 
 QueryColor = QuerySdf
@@ -81,14 +82,13 @@ def colour_from_views(
     """
     if len(mesh.faces) == 0:
         return colour_mesh(mesh, query_color)
-    chosen = np.unique(np.linspace(0, max(len(frames) - 1, 0), min(MAX_COLOUR_FRAMES, len(frames))).round().astype(int))
     vertices = np.ascontiguousarray(mesh.vertices)
     normals = vertex_normals(mesh)
     spheres = _spheres(vertices)
     mean: np.ndarray = np.zeros((len(vertices), 3), np.float32)
     for inv_variance in (0.0, 1 / COLOUR_NOISE**2):
         sums = np.zeros((len(vertices), 4), np.float32)
-        for frame in (frames[int(i)] for i in chosen):
+        for frame in spread(frames, MAX_COLOUR_FRAMES):
             kernels.add_colours(
                 spheres, vertices, normals, *_pose(frame), frame.depth, frame.rgb, np.float32(frame.camera.near),
                 np.float32(frame.depth.max()), np.float32(settings.colour_tolerance_m), np.float32(MIN_COSINE),

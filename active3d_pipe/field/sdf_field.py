@@ -11,6 +11,7 @@ from active3d_pipe.field import kernels
 from active3d_pipe.field.config import FieldSettings
 from active3d_pipe.field.encoders import Planes, make_encoders
 from active3d_pipe.field.encoding import BlobLayout, EncodeGrid, check_memory, lowest_nodes, node_counts
+from active3d_pipe.field.normals import unit_gradients
 from active3d_pipe.structures import VoxelGrid
 
 
@@ -229,12 +230,7 @@ class SdfField(torch.nn.Module):
         Differences over a tetrahedron of edge vectors (+-1, +-1, +-1) * step_m; zero where the field is flat.
         """
         points = _as_points(points)
-        corners = np.array([[1, -1, -1], [-1, -1, 1], [-1, 1, -1], [1, 1, 1]], np.float32)
-        at = points[None] + np.float32(step_m) * corners[:, None]
-        sdf = self._decode(at.reshape(-1, 3), with_sigma=False)[:, 0].reshape(4, -1)
-        gradient = np.einsum("kn,kc->nc", sdf, corners)
-        norm = np.linalg.norm(gradient, axis=1, keepdims=True)
-        return np.divide(gradient, norm, out=np.zeros_like(gradient), where=norm > 1e-8)
+        return unit_gradients(lambda at: self._decode(at, with_sigma=False)[:, 0], points, step_m)
 
     def count_visits(self, points: np.ndarray) -> None:
         """Count training samples (N, 3) in the cells of `visit_grid`; counts saturate."""

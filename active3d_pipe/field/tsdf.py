@@ -8,12 +8,12 @@ from active3d_pipe.errors import ArtifactError, ConfigError
 from active3d_pipe.field import kernels_tsdf as kernels
 from active3d_pipe.field.config import TsdfSettings
 from active3d_pipe.field.encoding import check_memory
+from active3d_pipe.field.normals import unit_gradients
 from active3d_pipe.geometry import se3
 from active3d_pipe.structures import Frame
 
 MARK_STRIDE = 2  # px between the readings that allocate blocks; a block is many pixels wide
 WIDTH = 6  # values of a voxel
-CORNERS = np.array([[1, -1, -1], [-1, -1, 1], [-1, 1, -1], [1, 1, 1]], np.float32)
 
 
 class TsdfField:
@@ -121,10 +121,7 @@ class TsdfField:
     def normals(self, points: np.ndarray, step_m: float = 0.01) -> np.ndarray:
         """(N, 3) float32 unit SDF gradients at world points (N, 3), see `SdfField.normals`."""
         points = np.ascontiguousarray(points, np.float32).reshape(-1, 3)
-        at = points[None] + np.float32(step_m) * CORNERS[:, None]
-        gradient = np.einsum("kn,kc->nc", self.query_sdf(at.reshape(-1, 3)).reshape(4, -1), CORNERS)
-        norm = np.linalg.norm(gradient, axis=1, keepdims=True)
-        return np.divide(gradient, norm, out=np.zeros_like(gradient), where=norm > 1e-8)
+        return unit_gradients(self.query_sdf, points, step_m)
 
     def state(self) -> dict[str, np.ndarray]:
         """Blocks, voxels and `boxes`, those at creation and now (copies); `load_state` restores them exactly."""

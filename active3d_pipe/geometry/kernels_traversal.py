@@ -11,6 +11,8 @@ from numba import njit
 
 # Stands for infinity: fastmath kernels must not meet a real one.
 FAR = np.float32(1e30)
+# A direction component below this does not move along its axis.
+TINY = np.float32(1e-12)
 ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 
 
@@ -33,6 +35,34 @@ def entry_parameter(px, py, pz, dx, dy, dz, nx, ny, nz):
     return t0 if t0 <= t1 else np.float32(-1.0)
 
 
+@njit(fastmath=True, cache=True, inline="always")
+def start_voxel(px, py, pz, dx, dy, dz, t, nx, ny, nz):
+    """Voxel (i, j, k) of a ray at parameter t, the nearest of the grid when rounding puts it outside."""
+    i = min(max(np.int32(np.floor(px + t * dx)), 0), nx - 1)
+    j = min(max(np.int32(np.floor(py + t * dy)), 0), ny - 1)
+    k = min(max(np.int32(np.floor(pz + t * dz)), 0), nz - 1)
+    return i, j, k
+
+
+@njit(fastmath=True, cache=True, inline="always")
+def voxel_length(d):
+    """Ray parameter that one voxel is long along an axis, FAR when the ray does not move along it."""
+    return ONE / abs(d) if abs(d) > TINY else FAR
+
+
+@njit(fastmath=True, cache=True, inline="always")
+def next_border(i, p, d):
+    """Ray parameter at which voxel i of an axis is left, FAR when the ray does not move along it."""
+    return (np.float32(i + (1 if d > 0 else 0)) - p) / d if abs(d) > TINY else FAR
+
+
+@njit(fastmath=True, cache=True, inline="always")
+def cell_bit(x, y, z):
+    """Bit 4 a + 2 b + c, uint8, of the half-size cell of a voxel in which a point lies (voxel units, x, y, z >= 0)."""
+    a, b, c = np.int32(x + x) & 1, np.int32(y + y) & 1, np.int32(z + z) & 1
+    return np.uint8(1 << (4 * a + 2 * b + c))
+
+
 @njit(fastmath=True, cache=True)
 def walk_ray(opaque, px, py, pz, dx, dy, dz, t_end, nx, ny, nz, ids):
     """Voxels that a ray crosses, in order, up to t_end or the first opaque one, which is included.
@@ -43,17 +73,10 @@ def walk_ray(opaque, px, py, pz, dx, dy, dz, t_end, nx, ny, nz, ids):
     t = entry_parameter(px, py, pz, dx, dy, dz, nx, ny, nz)
     if t < ZERO or t > t_end:
         return 0
-    i = min(max(np.int32(np.floor(px + t * dx)), 0), nx - 1)
-    j = min(max(np.int32(np.floor(py + t * dy)), 0), ny - 1)
-    k = min(max(np.int32(np.floor(pz + t * dz)), 0), nz - 1)
+    i, j, k = start_voxel(px, py, pz, dx, dy, dz, t, nx, ny, nz)
     si, sj, sk = (1 if dx > 0 else -1), (1 if dy > 0 else -1), (1 if dz > 0 else -1)
-    tiny = np.float32(1e-12)
-    ex = ONE / abs(dx) if abs(dx) > tiny else FAR
-    ey = ONE / abs(dy) if abs(dy) > tiny else FAR
-    ez = ONE / abs(dz) if abs(dz) > tiny else FAR
-    tx = (np.float32(i + (1 if si > 0 else 0)) - px) / dx if abs(dx) > tiny else FAR
-    ty = (np.float32(j + (1 if sj > 0 else 0)) - py) / dy if abs(dy) > tiny else FAR
-    tz = (np.float32(k + (1 if sk > 0 else 0)) - pz) / dz if abs(dz) > tiny else FAR
+    ex, ey, ez = voxel_length(dx), voxel_length(dy), voxel_length(dz)
+    tx, ty, tz = next_border(i, px, dx), next_border(j, py, dy), next_border(k, pz, dz)
     n = 0
     while True:
         v = (i * ny + j) * nz + k

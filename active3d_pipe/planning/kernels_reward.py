@@ -9,7 +9,8 @@ are the cells of voxels of `kernels_sight`.
 import numpy as np
 from numba import njit, prange
 
-from active3d_pipe.planning.kernels_sight import cast, cell_bit, cell_share, distance_to, surface_share
+from active3d_pipe.geometry.kernels_traversal import cell_bit
+from active3d_pipe.planning.kernels_sight import cast, cell_share, distance_to, surface_share
 
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
 # A surface seen edge-on would cover a ray's whole solid angle many times over; below this the estimate is capped.

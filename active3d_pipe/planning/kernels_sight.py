@@ -10,7 +10,13 @@ bits 4 a + 2 b + c of the upper cell in x, y, z. Sight goes on through clear cel
 import numpy as np
 from numba import njit, prange
 
-from active3d_pipe.geometry.kernels_traversal import FAR, entry_parameter
+from active3d_pipe.geometry.kernels_traversal import (
+    cell_bit,
+    entry_parameter,
+    next_border,
+    start_voxel,
+    voxel_length,
+)
 
 ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 # Shorter jumps cost more than the steps they save.
@@ -30,13 +36,6 @@ def surface_share(normal, v, dx, dy, dz, voxel_size, t, quality, enough, quality
         cos = min(ONE, abs(a * dx + b * dy + c * dz) * voxel_size / norm)
     new = cos * min(ONE, quality_range / max(t, np.float32(1e-3)))
     return max(ZERO, min(new, enough) - quality[v]) / enough, cos
-
-
-@njit(fastmath=True, cache=True, inline="always")
-def cell_bit(x, y, z):
-    """Bit of the half-size cell in which a point lies (voxel units, x, y, z >= 0)."""
-    a, b, c = np.int32(np.float32(2) * x) & 1, np.int32(np.float32(2) * y) & 1, np.int32(np.float32(2) * z) & 1
-    return np.uint8(1 << (4 * a + 2 * b + c))
 
 
 @njit(fastmath=True, cache=True)
@@ -63,18 +62,10 @@ def walk_sight(stops, clear, skip, voxel_size, px, py, pz, dx, dy, dz, t_end, sh
     t = entry_parameter(px, py, pz, dx, dy, dz, nx, ny, nz)
     if t < ZERO or t > t_end:
         return 0, np.uint8(0)
-    i = min(max(np.int32(np.floor(px + t * dx)), 0), nx - 1)
-    j = min(max(np.int32(np.floor(py + t * dy)), 0), ny - 1)
-    k = min(max(np.int32(np.floor(pz + t * dz)), 0), nz - 1)
+    i, j, k = start_voxel(px, py, pz, dx, dy, dz, t, nx, ny, nz)
     si, sj, sk = (1 if dx > 0 else -1), (1 if dy > 0 else -1), (1 if dz > 0 else -1)
-    tiny = np.float32(1e-12)
-    ex = ONE / abs(dx) if abs(dx) > tiny else FAR
-    ey = ONE / abs(dy) if abs(dy) > tiny else FAR
-    ez = ONE / abs(dz) if abs(dz) > tiny else FAR
-    sx, sy, sz = np.float32(si) * ex, np.float32(sj) * ey, np.float32(sk) * ez
-    tx = (np.float32(i + (1 if si > 0 else 0)) - px) / dx if abs(dx) > tiny else FAR
-    ty = (np.float32(j + (1 if sj > 0 else 0)) - py) / dy if abs(dy) > tiny else FAR
-    tz = (np.float32(k + (1 if sk > 0 else 0)) - pz) / dz if abs(dz) > tiny else FAR
+    ex, ey, ez = voxel_length(dx), voxel_length(dy), voxel_length(dz)
+    tx, ty, tz = next_border(i, px, dx), next_border(j, py, dy), next_border(k, pz, dz)
     n = 0
     while True:
         v = (i * ny + j) * nz + k
@@ -88,19 +79,16 @@ def walk_sight(stops, clear, skip, voxel_size, px, py, pz, dx, dy, dz, t_end, sh
             )
             if i < 0 or j < 0 or k < 0 or i >= nx or j >= ny or k >= nz:
                 return n, np.uint8(0)
-            tx = (np.float32(i + (1 if si > 0 else 0)) - px) * sx if ex < FAR else FAR
-            ty = (np.float32(j + (1 if sj > 0 else 0)) - py) * sy if ey < FAR else FAR
-            tz = (np.float32(k + (1 if sk > 0 else 0)) - pz) * sz if ez < FAR else FAR
+            tx, ty, tz = next_border(i, px, dx), next_border(j, py, dy), next_border(k, pz, dz)
             continue
         t_out = min(tx, min(ty, tz))
-        ids[n] = v
-        if skip[v] != 0:
-            pass
-        elif stops[v] != 0:
+        if stops[v] != 0:
             bit = blocked_cell(clear[v], px, py, pz, dx, dy, dz, t, t_out)
             if bit:
+                ids[n] = v
                 return n + 1, bit
-        else:
+        elif skip[v] == 0:
+            ids[n] = v
             n += 1
         if t_out > t_end:
             return n, np.uint8(0)

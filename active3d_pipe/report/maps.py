@@ -10,6 +10,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
+from active3d_pipe.geometry.sampling import spread
 from active3d_pipe.report.config import ReportSettings
 from active3d_pipe.report.data import FloorPlan, HeldOutView, SliceSeries
 from active3d_pipe.report.style import UNKNOWN, colorize, draw, photo
@@ -25,14 +26,6 @@ def views_section(views: Sequence[HeldOutView], settings: ReportSettings) -> str
     for i, view in enumerate(views):
         parts.append(_view(view, settings, deepest, unfold=i == 0))
     return "\n".join(parts)
-
-
-def spread(items: Sequence, count: int) -> list:
-    """At most `count` items, evenly chosen, first and last included."""
-    if len(items) <= count:
-        return list(items)
-    places = np.unique(np.linspace(0, len(items) - 1, count).round().astype(int)) if count > 0 else ()
-    return [items[p] for p in places]
 
 
 def _deepest(view: HeldOutView) -> float:

@@ -5,6 +5,7 @@ from html import escape
 
 import numpy as np
 
+from active3d_pipe.geometry.sampling import spread
 from active3d_pipe.report import figures, maps, tables
 from active3d_pipe.report.config import ReportSettings
 from active3d_pipe.report.css import CSS
@@ -119,7 +120,7 @@ def _fusion(data: ReportData, settings: ReportSettings) -> str:
 def _decisions(data: ReportData, settings: ReportSettings) -> str:
     if not data.decisions:
         return ""
-    rows = maps.spread(data.decisions, settings.max_decisions)
+    rows = spread(data.decisions, settings.max_decisions)
     chart = figures.gains(data.decisions, settings.figure_scale) if _has_gains(data) else ""
     return chart + (tables.decisions_table(rows) if rows else "")
 

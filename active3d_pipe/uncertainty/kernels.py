@@ -11,6 +11,8 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from active3d_pipe.geometry.kernels_traversal import cell_bit
+
 CHUNKS = 2
 
 
@@ -119,12 +121,6 @@ def _advance(v, t1, pitch, left, t, length):
     return v, t[2], (left[0], left[1], left[2] - 1), (t[0], t[1], t[2] + length[2])
 
 
-@njit(cache=True, inline="always")
-def _cell_bit(x, y, z):
-    """Bit of the half-size cell, of the eight that a voxel holds, in which a point lies (voxel units, >= 0)."""
-    return np.uint8(1 << (4 * (int(2 * x) & 1) + 2 * (int(2 * y) & 1) + (int(2 * z) & 1)))
-
-
 @njit(cache=True)
 def _count_free(ox, oy, oz, ex, ey, ez, shape, free, passed, stamp, frame_id):
     """Add 1 to every voxel that the segment o -> e (voxel units) crosses and that no ray of this frame hit.
@@ -142,8 +138,8 @@ def _count_free(ox, oy, oz, ex, ey, ez, shape, free, passed, stamp, frame_id):
         if passed[np.uintp(here)] != 255:
             out = min(t, t1)
             a, b = 0.75 * t0 + 0.25 * out, 0.25 * t0 + 0.75 * out
-            bits = _cell_bit(ox + a * dx, oy + a * dy, oz + a * dz)
-            passed[np.uintp(here)] |= bits | _cell_bit(ox + b * dx, oy + b * dy, oz + b * dz)
+            bits = cell_bit(ox + a * dx, oy + a * dy, oz + a * dz)
+            passed[np.uintp(here)] |= bits | cell_bit(ox + b * dx, oy + b * dy, oz + b * dz)
 
 
 @njit(cache=True)
@@ -163,7 +159,7 @@ def _carve_frame(depth, camera, pose, reach, start, stride, grid, footprint, out
             x, y, z = math.floor(ex), math.floor(ey), math.floor(ez)
             if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
                 hit[x, y, z] += 1
-                ended[x, y, z] |= _cell_bit(ex, ey, ez)
+                ended[x, y, z] |= cell_bit(ex, ey, ez)
                 stamp[x, y, z] = frame_id
                 # A hit voxel was seen, so its quality is never zero, even where no normal can be measured.
                 cosine = max(_incidence_cosine(depth, i, j, stride, camera), 0.1)
@@ -187,7 +183,7 @@ def carve_frames(
 
     depths (F, H, W) f32; cameras (F, 4) fx fy cx cy; poses (F, 3, 4) camera -> world; reaches (F, 2) near, far;
     starts (F, 2) first row and column; free, hit (CHUNKS, X, Y, Z) i32, quality f32 and the half-size cells that
-    rays passed and ended in, u8 bits (`_cell_bit`), are added to in place.
+    rays passed and ended in, u8 bits (`cell_bit`), are added to in place.
     """
     stamp = np.full(free.shape, -1, np.int32)
     for c in prange(CHUNKS):

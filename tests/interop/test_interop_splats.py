@@ -16,6 +16,7 @@ import pytest
 
 from active3d_pipe.gaussians.parameters import GaussianParameters
 from active3d_pipe.gaussians.rasteriser import render_view
+from active3d_pipe.geometry.sampling import spread
 from active3d_pipe.pipeline.config import Config, load_run_config
 from active3d_pipe.sim.observable import held_out_poses
 from active3d_pipe.storage import capture_log, splats
@@ -75,7 +76,7 @@ class Judge:
         clearance = config.evaluation.view_clearance_m
         held_out = held_out_poses(simulator, VIEWS, simulator.scene.name, min_clearance_m=clearance)
         self.camera: Camera = simulator.camera
-        self.poses = [f.T_world_camera for f in shared.spread(frames, VIEWS)] + list(held_out)
+        self.poses = [f.T_world_camera for f in spread(frames, VIEWS)] + list(held_out)
         self.truths = [simulator.render(T).rgb.astype(np.float32) / 255 for T in self.poses]
         values = read_tensors(run / "export" / "gaussians.safetensors")[0]["values"]
         model, settings = GaussianParameters.from_values(values).to_model(), config.mapping.gaussians
