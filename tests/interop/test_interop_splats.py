@@ -20,7 +20,7 @@ from active3d_pipe.geometry.sampling import spread
 from active3d_pipe.pipeline.config import Config, load_run_config
 from active3d_pipe.sim.observable import held_out_poses
 from active3d_pipe.storage import capture_log, splats
-from active3d_pipe.storage.files import read_tensors
+from active3d_pipe.storage.files import read_json, read_tensors
 from active3d_pipe.structures import Camera
 from stages import shared
 from tests.interop.conftest import NODE, need, run_program
@@ -64,7 +64,7 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 
 class Judge:
-    """Truth and our own image of some captured frames and some held-out views of a run, at a given width."""
+    """Truth and our own image of some keyframes and some held-out views of a run, at a given width."""
 
     def __init__(self, run: Path, width: int | None = None) -> None:
         config = load_run_config(run / "run.toml", Config)
@@ -73,6 +73,9 @@ class Judge:
         config = config.model_copy(update={"camera": config.camera.model_copy(update=size)})
         simulator = shared.make_simulator(config, config.run.seed)
         frames = [f for p in sorted(run.glob("capture/*/frames.mcap")) for f in capture_log.read_frames(p)]
+        # What the last frame of a run shows for the first time is in no keyframe, and hardly learnt by a short run.
+        keys = {key["step"] for key in read_json(run / "export" / "keyframes.json")}
+        frames = [f for f in frames if f.step in keys]
         clearance = config.evaluation.view_clearance_m
         held_out = held_out_poses(simulator, VIEWS, simulator.scene.name, min_clearance_m=clearance)
         self.camera: Camera = simulator.camera
@@ -92,10 +95,9 @@ class Judge:
             line = f"{name} {size} {kind}: {b[part].mean():.2f} dB, ours {a[part].mean():.2f} dB"
             log.info("%s; gap by view %s", line, np.round(a[part] - b[part], 2).tolist())
             assert a[part].mean() - b[part].mean() <= most_db, line
-        # Wrong views, of other poses say, score below 12 dB. A short run has not seen all that held-out views show, and
-        # not learnt all that its last frames show.
-        typical = min(np.median(a[: self.captured]), np.median(b[: self.captured]))
-        assert typical > 20, f"{name} {size}: ours {a}, theirs {b}"
+        # A wrong view, of another pose say, scores below 12 dB. A short run has not seen all that held-out views show.
+        worst = min(a[: self.captured].min(), b[: self.captured].min())
+        assert worst > 20, f"{name} {size}: ours {a}, theirs {b}"
 
 
 @pytest.fixture(scope="session")
