@@ -15,7 +15,7 @@ from active3d_pipe.mapping.config import MappingSettings
 from active3d_pipe.mapping.hybrid_map import HybridMap
 from active3d_pipe.mapping.refine import refine
 from active3d_pipe.mapping.update import open_submap, update_map
-from active3d_pipe.pipeline.config import load_config, with_values
+from active3d_pipe.pipeline.config import load_config
 from active3d_pipe.pipeline.layers import read_toml
 from active3d_pipe.structures import Camera
 
@@ -71,8 +71,13 @@ def test_every_file_lies_on_top_of_the_defaults() -> None:
     assert load_config(str(FOLDER.joinpath("hybrid.toml"))) == base
     for name in PRESETS:
         config = load_config(str(FOLDER.joinpath(f"{name}.toml")))
-        same = with_values(
-            config, mapping=base.mapping.model_dump(), uncertainty=base.uncertainty.model_dump()
+        assert config.export.mesh.dispute_m == 0.0, f"{name}: the mesh must be the map's own surface"
+        mesh = config.export.mesh.model_copy(update={"dispute_m": base.export.mesh.dispute_m})
+        same = config.model_copy(
+            update={
+                "mapping": base.mapping, "uncertainty": base.uncertainty,
+                "export": config.export.model_copy(update={"mesh": mesh}),
+            }
         )
         assert same == base and config.mapping != base.mapping, name
 
