@@ -1,4 +1,4 @@
-"""A sweep: variants x scenes x seeds, one ordinary run folder each, one after the other. Knows no 3D.
+"""A sweep: variants x scenes x seeds, one ordinary run folder each, some at a time. Knows no 3D.
 
     OUT/sweep.json                        what was asked for, and how every run ended
     OUT/<scene>/<variant>/seed_<n>/       a run folder as `active3d run` makes it
@@ -10,8 +10,10 @@ by its own run. A run that fails is marked and does not stop the others; the nex
 import json
 import re
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 from active3d_pipe.errors import ConfigError
@@ -166,29 +168,49 @@ class Sweep:
         return ended if ended is not None and ended.key == cell.key else None
 
     def run(
-        self, execute: Callable[[Cell, Path], str], say: Callable[[str], None], is_complete: Callable[[Path], bool]
+        self, execute: Callable[[Cell, Path], str], say: Callable[[str], None], is_complete: Callable[[Path], bool],
+        jobs: int = 1,
     ) -> int:
-        """Run what is not done; returns how many failed.
+        """Run what is not done, `jobs` runs at a time; returns how many failed.
 
         Args:
-            execute: makes one run; returns "" or one line that says why it failed. It may raise to stop the sweep.
+            execute: makes one run; returns "" or one line that says why it failed. It may raise to stop the sweep;
+                what runs beside it ends first. Called from threads.
             say: called with one line before and after every run.
             is_complete: whether a run folder holds what the tables are made of.
         """
         self._write()
-        failed = 0
+        failed, stopped = 0, Event()
+        left: list[tuple[str, Cell]] = []
         for n, cell in enumerate(self.cells, 1):
             place = f"[{n}/{len(self.cells)}] {cell.scene} {cell.variant} seed {cell.seed}"
             before = self.state(cell)
             if before is not None and before.state == "done" and is_complete(cell.folder(self.out)):
                 say(f"{place}: done before")
-                continue
+            else:
+                left.append((place, cell))
+
+        def one(place: str, cell: Cell) -> str | None:
+            if stopped.is_set():
+                return None
             say(f"{place} ...")
-            error = execute(cell, cell.folder(self.out))
-            self.ended[self._name(cell)] = Ended("failed" if error else "done", cell.key, error)
-            failed += bool(error)
-            self._write()
-            say(f"{place}: {'FAILED: ' + error if error else 'done'}")
+            try:
+                return execute(cell, cell.folder(self.out))
+            except BaseException:
+                stopped.set()  # before this thread takes the next run
+                raise
+
+        with ThreadPoolExecutor(max(1, jobs)) as pool:
+            futures = {pool.submit(one, place, cell): (place, cell) for place, cell in left}
+            for future in as_completed(futures):
+                place, cell = futures[future]
+                error = future.result()
+                if error is None:
+                    continue
+                self.ended[self._name(cell)] = Ended("failed" if error else "done", cell.key, error)
+                failed += bool(error)
+                self._write()
+                say(f"{place}: {'FAILED: ' + error if error else 'done'}")
         return failed
 
     def _name(self, cell: Cell) -> str:

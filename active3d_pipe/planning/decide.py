@@ -97,9 +97,12 @@ def _choose(
     """The decision itself, without the account of predicted and realised gain."""
     T, camera, motion, settings = task.T, task.camera, task.motion, task.settings
     best = 0.0
-    for relaxed in (False, True):
-        space = build_free_space(volume, T, walked[:, :3, 3], motion, settings, relaxed=relaxed)
-        pool = score(space, field, T, camera, motion, settings, previous)
+    # The quick search overlooks what few views can see; only a thorough one may say that nothing is left.
+    for relaxed, thorough in ((False, False), (False, True), (True, False)):
+        if not thorough:
+            space = build_free_space(volume, T, walked[:, :3, 3], motion, settings, relaxed=relaxed)
+        how = _thorough(settings) if thorough else settings
+        pool = score(space, field, T, camera, motion, how, previous)
         best = max((t.reward for t in pool.terms), default=0.0)
         if best >= settings.stop_reward:
             decision = _go(task, space, pool, field, Reason.RELAXED if relaxed else Reason.BEST_GAIN)
@@ -110,6 +113,12 @@ def _choose(
         ranking = pool.ranking(settings.num_ranked, {})
         return Decision(volume.round, Reason.STOP_GAIN, True, np.zeros((0, 4, 4)), ranking, -1, terms)
     return _unstick(task, space, walked, previous, terms)
+
+
+def _thorough(settings: PlanningSettings) -> PlanningSettings:
+    """The same search with several times the positions, targets and exactly scored views."""
+    names = ("max_positions", "max_targets", "refine_top", "exact_top")
+    return settings.model_copy(update={n: getattr(settings, n) * settings.stop_search for n in names})
 
 
 def bootstrap_decision(T_start: np.ndarray, motion: MotionSettings, settings: PlanningSettings) -> Decision:

@@ -1,3 +1,5 @@
+from threading import Barrier
+
 import pytest
 
 from active3d_pipe.errors import ConfigError
@@ -62,7 +64,7 @@ def test_mistakes_are_one_line(tmp_path, change, said):
     assert "\n" not in str(error.value)
 
 
-def drive(spec, out, fails=(), stop_at=None):
+def drive(spec, out, fails=(), stop_at=None, jobs=1):
     ran, said = [], []
 
     def execute(cell, folder):
@@ -76,7 +78,7 @@ def drive(spec, out, fails=(), stop_at=None):
         return ""
 
     sweep = s.Sweep(out, spec)
-    failed = sweep.run(execute, said.append, lambda folder: (folder / "done").exists())
+    failed = sweep.run(execute, said.append, lambda folder: (folder / "done").exists(), jobs)
     return ran, said, failed, sweep
 
 
@@ -93,11 +95,27 @@ def test_finished_runs_are_skipped_and_failed_ones_do_not_stop_the_others(spec, 
     assert all(sweep.state(c).state == "done" for c in sweep.cells)
 
 
-def test_an_interrupted_sweep_goes_on(spec, tmp_path):
+@pytest.mark.parametrize("jobs", [1, 3])
+def test_an_interrupted_sweep_goes_on(spec, tmp_path, jobs):
     with pytest.raises(KeyboardInterrupt):
-        drive(spec, tmp_path, stop_at=3)
-    ran, *_ = drive(spec, tmp_path)
-    assert len(ran) == 5
+        drive(spec, tmp_path, stop_at=3, jobs=jobs)
+    ran, *_, sweep = drive(spec, tmp_path, jobs=jobs)
+    assert len(ran) >= 5 and all(sweep.state(c).state == "done" for c in sweep.cells)
+
+
+def test_runs_go_on_side_by_side_and_none_begins_after_a_stop(spec, tmp_path):
+    both, ran = Barrier(2, timeout=60), []
+
+    def execute(cell, folder):
+        ran.append(cell)
+        if len(ran) <= 2:
+            both.wait()  # passes only if two runs are on their way at once
+            raise KeyboardInterrupt
+        return ""
+
+    with pytest.raises(KeyboardInterrupt):
+        s.Sweep(tmp_path, spec).run(execute, lambda _: None, lambda _: True, 2)
+    assert len(ran) == 2
 
 
 def test_other_settings_or_a_lost_folder_run_again(spec, tmp_path):
