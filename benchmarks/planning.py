@@ -24,6 +24,7 @@ from scipy.stats import spearmanr
 from active3d_pipe.evaluation.geometry_metrics import sample_surface
 from active3d_pipe.geometry import projection
 from active3d_pipe.information.entropy import bernoulli_entropy
+from active3d_pipe.information.gain import entropy_drop
 from active3d_pipe.planning import decide as decide_module
 from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.decide import bootstrap_decision
@@ -56,6 +57,7 @@ class CarvedWorld:
         self.curve: list[float] = []
         self.vain = np.zeros(self.grid.shape, np.float32)
         self.covered = np.zeros(len(truth), bool)
+        self.last: UncertaintyVolume | None = None
 
     def capture(self, poses: np.ndarray, first_step: int) -> None:
         """Frames at poses (N, 4, 4)."""
@@ -92,7 +94,10 @@ class CarvedWorld:
             "entropy_exp": entropy, "entropy": entropy, "sdf": sdf, "free_evidence": e.free, "hit_evidence": e.hit,
             "view_quality": e.quality, "cells_passed": e.passed, "cells_hit": e.ended, "vain_looks": self.vain,
         }
-        return UncertaintyVolume(self.grid, round_index, {k: a.astype(np.float32) for k, a in arrays.items()})
+        arrays = {k: a.astype(np.float32) for k, a in arrays.items()}
+        drop = None if self.last is None else entropy_drop(self.last.arrays, arrays)
+        self.last = UncertaintyVolume(self.grid, round_index, arrays, drop_bits=drop)
+        return self.last
 
 
 def watch(seconds: dict[str, list[float]]) -> None:

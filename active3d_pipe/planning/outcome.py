@@ -1,8 +1,9 @@
 """What a decision promised and what came of it: predicted against realised entropy drop, branch by branch.
 
 The prediction is Delta I of eq. nbv_eig over everything that the poses of the executed path will see, each voxel
-once, at the best of the looks that it gets. The outcome is the drop of each branch's total entropy from the volume of
-the decision to the next one. The ratio of both over the past decisions corrects the next prediction.
+once, at the best of the looks that it gets. The outcome is the drop of each branch's entropy from the volume of
+the decision to the next one, over the voxels that rays reached meanwhile. The ratio of both over the past decisions
+corrects the next prediction.
 """
 
 from dataclasses import dataclass
@@ -70,28 +71,23 @@ def account_terms(
     """Entries of `Decision.terms`: this decision's prediction, the last one's outcome, the sums carried on.
 
     `predicted_imp`, `predicted_exp`: corrected prediction, bits; `raw_imp`, `raw_exp` before the correction;
-    `entropy_imp_bits`, `entropy_exp_bits`: totals that the next decision compares with; `account`: running sums;
-    `voxels` of the grid; `previous`: prediction and outcome of the decision before, absent when it made none.
+    `account`: running sums; `previous`: prediction and outcome of the decision before, absent when it made none.
     """
-    entropy = tuple(float(volume[f"entropy_{b}"].sum(dtype=np.float64)) for b in BRANCHES)
     account, outcome = Account(), None
     before = {} if previous is None else previous.terms
     if "account" in before:
         account = Account(tuple(before["account"]["predicted"]), tuple(before["account"]["realised"]))
-    if "raw_imp" in before and previous is not None and len(previous.path):
-        # Where the grid has grown, what is new was unseen before: one bit a voxel in each branch.
-        new = volume.grid.size - before.get("voxels", volume.grid.size)
-        realised = tuple(before[f"entropy_{b}_bits"] + new - e for b, e in zip(BRANCHES, entropy, strict=True))
-        account = account.with_outcome((before["raw_imp"], before["raw_exp"]), (realised[0], realised[1]))
+    realised = volume.drop_bits
+    if "raw_imp" in before and realised is not None and previous is not None and len(previous.path):
+        account = account.with_outcome((before["raw_imp"], before["raw_exp"]), realised)
         outcome = {f"predicted_{b}": before[f"predicted_{b}"] for b in BRANCHES}
         outcome |= {f"realised_{b}": r for b, r in zip(BRANCHES, realised, strict=True)}
     factors = account.correction(raw)
     terms: dict[str, Any] = {
         "account": {"predicted": list(account.predicted), "realised": list(account.realised)},
-        "voxels": volume.grid.size,
     }
-    for b, e, r, f in zip(BRANCHES, entropy, raw, factors, strict=True):
-        terms |= {f"entropy_{b}_bits": e, f"raw_{b}": r, f"predicted_{b}": r * f}
+    for b, r, f in zip(BRANCHES, raw, factors, strict=True):
+        terms |= {f"raw_{b}": r, f"predicted_{b}": r * f}
     if outcome is not None:
         terms["previous"] = outcome
     return terms

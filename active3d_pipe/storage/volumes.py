@@ -30,7 +30,10 @@ def write_volume(path: Path, volume: UncertaintyVolume) -> None:
     codec = ZstdCodec(level=3, checksum=True)
     with writing(path):
         root: Any = zarr.create_group(store=str(path), zarr_format=3, attributes=_attributes(volume))
-        group = root.create_group(GROUP, attributes={"grid": _grid_document(grid), "fusion": volume.fusion})
+        attributes: dict[str, Any] = {"grid": _grid_document(grid), "fusion": volume.fusion}
+        if volume.drop_bits is not None:
+            attributes["drop_bits"] = list(volume.drop_bits)
+        group = root.create_group(GROUP, attributes=attributes)
         for name, (unit, meaning) in VOLUMES.items():
             array = group.create_array(
                 name, shape=shape, chunks=shape, dtype="float32", compressors=codec, fill_value=float("nan"),
@@ -67,7 +70,11 @@ def read_volume(path: Path) -> UncertaintyVolume:
             if np.isnan(values).any():  # the fill value: a chunk is missing
                 raise ArtifactError(f"{path}: {name} has missing chunks; restore the file or re-run the stage")
             arrays[name] = values
-        return UncertaintyVolume(grid, int(group["round"][0]), arrays, json.loads(json.dumps(group.attrs["fusion"])))
+        drop = group.attrs.get("drop_bits")
+        return UncertaintyVolume(
+            grid, int(group["round"][0]), arrays, json.loads(json.dumps(group.attrs["fusion"])),
+            None if drop is None else (float(drop[0]), float(drop[1])),
+        )
 
 
 def read_fusion(path: Path) -> dict[str, Any]:

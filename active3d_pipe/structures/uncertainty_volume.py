@@ -39,12 +39,15 @@ class UncertaintyVolume:
         arrays: one array for every name in `VOLUMES`.
         fusion: what evidence maximisation found: `alphas` (3,), `evidence`, `noise`, and the running
             statistics it needs next round, as plain JSON values.
+        drop_bits: (field's, Gaussians') entropy lost since the volume before, bits, over the voxels that rays of this
+            round reached; None when there is none before.
     """
 
     grid: VoxelGrid
     round: int
     arrays: dict[str, np.ndarray]
     fusion: dict = field(default_factory=dict)
+    drop_bits: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         for name in ZERO_BY_DEFAULT:

@@ -34,10 +34,10 @@ def on_grid(volume: UncertaintyVolume, grid: VoxelGrid) -> UncertaintyVolume:
             f"which does not lie in grid {grid.shape} at {grid.origin.tolist()} voxel by voxel"
         )
     if not (below.any() or above.any()):
-        return UncertaintyVolume(grid, volume.round, volume.arrays, volume.fusion)
+        return UncertaintyVolume(grid, volume.round, volume.arrays, volume.fusion, volume.drop_bits)
     pad = list(zip(below, above, strict=True))
     arrays = {
         name: np.pad(a, pad, mode="edge") if name == "sdf" else np.pad(a, pad, constant_values=UNSEEN.get(name, 0.0))
         for name, a in volume.arrays.items()
     }
-    return UncertaintyVolume(grid, volume.round, arrays, volume.fusion)
+    return UncertaintyVolume(grid, volume.round, arrays, volume.fusion, volume.drop_bits)

@@ -8,6 +8,7 @@ from scipy.special import expit
 
 from active3d_pipe.errors import InputError, NumericalError
 from active3d_pipe.information.entropy import bernoulli_entropy
+from active3d_pipe.information.gain import entropy_drop
 from active3d_pipe.structures import Frame, GaussianModel, UncertaintyVolume, VoxelGrid
 from active3d_pipe.uncertainty import explicit, fusion, implicit, occupancy, temporal
 from active3d_pipe.uncertainty.carving import RayEvidence, integrate_depth, looks_in_vain
@@ -110,7 +111,8 @@ def compute_volume(  # noqa: PLR0913  (the inputs of the stage, by name)
         "cells_hit": evidence.ended,
     }
     arrays = {name: np.ascontiguousarray(array, dtype=np.float32) for name, array in arrays.items()}
-    return UncertaintyVolume(grid, round, arrays, fused.to_json(statistics, len(targets)))
+    drop = None if previous is None else entropy_drop(previous.arrays, arrays)
+    return UncertaintyVolume(grid, round, arrays, fused.to_json(statistics, len(targets)), drop)
 
 
 def revealed_rows(

@@ -7,6 +7,7 @@ import numpy as np
 from active3d_pipe.geometry import se3
 from active3d_pipe.geometry.voxel_traversal import carve, trace_depth
 from active3d_pipe.information.entropy import bernoulli_entropy
+from active3d_pipe.information.gain import entropy_drop
 from active3d_pipe.structures import Camera, Frame, UncertaintyVolume, VoxelGrid
 from active3d_pipe.uncertainty.carving import integrate_depth
 from active3d_pipe.uncertainty.config import UncertaintySettings
@@ -30,6 +31,7 @@ class BoxWorld:
     passed: np.ndarray = field(init=False)
     ended: np.ndarray = field(init=False)
     seen: np.ndarray = field(init=False)
+    last: UncertaintyVolume | None = field(init=False, default=None)
 
     def __post_init__(self):
         self.free, self.hit = np.zeros(self.grid.shape, np.int32), np.zeros(self.grid.shape, np.int32)
@@ -82,7 +84,9 @@ class BoxWorld:
             sdf=sdf, free_evidence=free, hit_evidence=hit, view_quality=self.quality,
             cells_passed=self.passed.astype(np.float32), cells_hit=self.ended.astype(np.float32),
         )
-        return UncertaintyVolume(self.grid, round_index, arrays)
+        drop = None if self.last is None else entropy_drop(self.last.arrays, arrays)
+        self.last = UncertaintyVolume(self.grid, round_index, arrays, drop_bits=drop)
+        return self.last
 
     def clearance(self, points):
         """True distance (m) of world points (N, 3) to the nearest solid fine voxel's cube."""

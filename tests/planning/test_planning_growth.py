@@ -1,26 +1,58 @@
-"""A grid that grew brings unseen voxels; what a decision brought is not judged by them."""
+"""What a decision brought: entropy lost where rays went, neither by growth of the grid nor by drift elsewhere."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from active3d_pipe.information.gain import entropy_drop
 from active3d_pipe.planning.outcome import account_terms
 from active3d_pipe.structures import VOLUMES, Decision, UncertaintyVolume, VoxelGrid
 from active3d_pipe.structures.decision import Reason
 from active3d_pipe.uncertainty.growth import grown_grid, on_grid
 
 
-def test_growth_is_not_counted_as_entropy_that_came_back():
+@pytest.fixture
+def volumes():
+    """Before and after a round that reached a quarter of the voxels, and which voxels these are."""
     grid, rng = VoxelGrid.from_bounds([0, 0, 0], [2, 2, 1], 0.1), np.random.default_rng(0)
     arrays = {name: rng.random(grid.shape, np.float32) for name in VOLUMES}
-    before = UncertaintyVolume(grid, 0, arrays)
+    reached = rng.random(grid.shape) < 0.25
+    changed = {
+        "entropy_imp": 0.5 * arrays["entropy_imp"],
+        "entropy_exp": np.where(reached, 0, 1).astype(np.float32),
+        "free_evidence": arrays["free_evidence"] + (reached & (rng.random(grid.shape) < 0.5)),
+    }
+    changed["hit_evidence"] = arrays["hit_evidence"] + (
+        reached & (changed["free_evidence"] == arrays["free_evidence"])
+    )
+    changed = {name: a.astype(np.float32) for name, a in changed.items()}
+    return UncertaintyVolume(grid, 0, arrays), UncertaintyVolume(grid, 1, {**arrays, **changed}), reached
+
+
+def test_drift_where_no_ray_went_is_no_outcome(volumes):
+    before, after, reached = volumes
+    imp, exp = entropy_drop(before.arrays, after.arrays)
+    assert imp == pytest.approx(0.5 * before["entropy_imp"][reached].sum(), rel=1e-4)
+    assert exp == pytest.approx(before["entropy_exp"][reached].sum(), rel=1e-4)
+
+
+def test_growth_is_not_counted_as_entropy_that_came_back(volumes):
+    before, after, _ = volumes
+    low, high = before.grid.low - 0.4, before.grid.high + 0.8
+    grown = [on_grid(v, grown_grid(v.grid, low, high)) for v in (before, after)]
+    want, got = entropy_drop(before.arrays, after.arrays), entropy_drop(*(v.arrays for v in grown))
+    assert got == pytest.approx(want, rel=1e-5)
+
+
+def test_the_next_decision_accounts_for_the_last(volumes):
+    before, after, _ = volumes
     terms = account_terms(before, (30.0, 40.0), None)
+    assert "previous" not in terms
     decision = Decision(
         round=0, reason=Reason.BEST_GAIN, stop=False, path=np.eye(4)[None], ranking=(), chosen=-1, terms=terms
     )
-    after = UncertaintyVolume(grid, 1, {**arrays, "entropy_imp": 0.5 * arrays["entropy_imp"]})
-    grown = on_grid(after, grown_grid(grid, grid.low - 0.4, grid.high + 0.8))
-    plain = account_terms(after, (1.0, 1.0), decision)["previous"]
-    same = account_terms(grown, (1.0, 1.0), decision)["previous"]
-    assert plain["realised_imp"] == pytest.approx(0.5 * arrays["entropy_imp"].sum(), rel=1e-4)
-    assert same["realised_imp"] == pytest.approx(plain["realised_imp"], abs=1e-2)
-    assert same["realised_exp"] == pytest.approx(plain["realised_exp"], abs=1e-2)
+    drop = entropy_drop(before.arrays, after.arrays)
+    outcome = account_terms(replace(after, drop_bits=drop), (1.0, 1.0), decision)["previous"]
+    assert outcome == {"predicted_imp": 30.0, "predicted_exp": 40.0, "realised_imp": drop[0], "realised_exp": drop[1]}
+    assert "previous" not in account_terms(after, (1.0, 1.0), decision)

@@ -37,7 +37,7 @@ def volume() -> UncertaintyVolume:
     rng = np.random.default_rng(2)
     grid = VoxelGrid(np.array([-1.0, 0.5, 0]), 0.1, (7, 5, 4))
     arrays = {name: rng.uniform(0, 1, grid.shape).astype(np.float32) for name in VOLUMES}
-    return UncertaintyVolume(grid, 3, arrays, {"alphas": [0.2, 0.3, 0.5], "noise": 0.25})
+    return UncertaintyVolume(grid, 3, arrays, {"alphas": [0.2, 0.3, 0.5], "noise": 0.25}, (120.5, -3.25))
 
 
 def gaussians(n: int = 20) -> GaussianModel:
@@ -92,7 +92,7 @@ def test_volume_round_trip_and_same_bytes(tmp_path: Path) -> None:
     w = volumes.read_volume(tmp_path / "a.zarr")
     assert w.round == 3
     assert w.grid.shape == v.grid.shape
-    assert w.fusion == v.fusion
+    assert w.fusion == v.fusion and w.drop_bits == v.drop_bits
     np.testing.assert_array_equal(w.grid.origin, v.grid.origin)
     for name in VOLUMES:
         np.testing.assert_array_equal(v[name], w[name])
