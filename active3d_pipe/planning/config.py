@@ -33,7 +33,7 @@ class PlanningSettings(Settings):
         (-60.0, -30.0, 0.0, 30.0, 60.0), min_length=1, description="view pitch, degrees, up > 0"
     )
     max_range_m: float = Field(5.0, gt=0, description="how far a view is expected to see, m")
-    exact_top: int = Field(12, ge=1, description="candidates whose visible set is computed exactly")
+    exact_top: int = Field(32, ge=1, description="candidates whose visible set is computed exactly")
     unknown_free_path_m: float = Field(
         1.0, gt=0, description="mean length of a ray through unknown space before something stops it, m"
     )
