@@ -5,6 +5,7 @@ several rounds concatenate), beside 1-D coordinate arrays of the same names as t
 """
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from active3d_pipe.structures.uncertainty_volume import ZERO_BY_DEFAULT
 
 GROUP = "scale0"
 MAX_VOXELS = 2**31
+_THREADS = 2  # for compression, which lets other threads run; the bytes do not depend on it
 
 
 def write_volume(path: Path, volume: UncertaintyVolume) -> None:
@@ -26,21 +28,26 @@ def write_volume(path: Path, volume: UncertaintyVolume) -> None:
 
     grid = volume.grid
     shape = (1, *grid.shape)
-    # Checksums: the default codecs pass every single-bit flip silently.
-    codec = ZstdCodec(level=3, checksum=True)
+    # Checksums: the default codecs pass every single-bit flip silently. Level 1 is twice as fast as 3, for 1 % more.
+    codec = ZstdCodec(level=1, checksum=True)
     with writing(path):
         root: Any = zarr.create_group(store=str(path), zarr_format=3, attributes=_attributes(volume))
         attributes: dict[str, Any] = {"grid": _grid_document(grid), "fusion": volume.fusion}
         if volume.drop_bits is not None:
             attributes["drop_bits"] = list(volume.drop_bits)
         group = root.create_group(GROUP, attributes=attributes)
-        for name, (unit, meaning) in VOLUMES.items():
+
+        def write(name: str) -> None:
+            unit, meaning = VOLUMES[name]
             array = group.create_array(
                 name, shape=shape, chunks=shape, dtype="float32", compressors=codec, fill_value=float("nan"),
                 dimension_names=("round", "x", "y", "z"), attributes={"units": unit, "long_name": meaning},
                 config={"write_empty_chunks": True},
             )
             array[...] = volume[name][None]
+
+        with ThreadPoolExecutor(_THREADS) as pool:
+            list(pool.map(write, VOLUMES))
         _write_axis(group, "round", np.array([volume.round], np.int64), "1", codec)
         for i, axis in enumerate("xyz"):
             _write_axis(group, axis, grid.axis(i), "m", codec)
