@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.ndimage import maximum_filter
+from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.special import expit
 
 from active3d_pipe.errors import InputError, NumericalError
@@ -15,6 +15,8 @@ from active3d_pipe.uncertainty.carving import RayEvidence, integrate_depth, look
 from active3d_pipe.uncertainty.config import UncertaintySettings
 from active3d_pipe.uncertainty.explicit import ViewResidual
 
+# Attention below which what the field says of a voxel counts for nothing.
+MASKED = 0.02
 FieldQuery = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
@@ -45,7 +47,8 @@ def compute_volume(  # noqa: PLR0913  (the inputs of the stage, by name)
     Args:
         grid: of every volume; `previous` must be on the same one.
         previous: volume of the last round, None in the first: it carries the evidence and the fusion statistics.
-        field_query: world points (N, 3) float32, m -> (sdf, sigma), (N,) each, m.
+        field_query: world points (N, 3) float32, m -> (sdf, sigma), (N,) each, m. Asked where it matters
+            (`open_to_the_field`); elsewhere the SDF stays what it was.
         gaussians: the explicit branch of this round's map.
         new_frames: frames captured since `previous`.
         views: renderings of keyframes with this round's map against their images.
@@ -60,7 +63,7 @@ def compute_volume(  # noqa: PLR0913  (the inputs of the stage, by name)
     fresh = integrate_depth(grid, new_frames, settings)
     evidence = before.joined(fresh)
 
-    sdf, sigma = _query(grid, field_query)
+    sdf, sigma = _query(grid, field_query, previous, open_to_the_field(evidence, settings))
     observed = occupancy.observation(evidence, settings)
     vain = looks_in_vain(grid, new_frames, evidence.hit > 0, settings)
     if previous is not None:
@@ -132,18 +135,38 @@ def revealed_rows(
     return rows, residual[revealed]
 
 
-def _query(grid: VoxelGrid, field_query: FieldQuery) -> tuple[np.ndarray, np.ndarray]:
-    """SDF and sigma at all voxel centres, float32 [X, Y, Z], m."""
-    values = field_query(grid.centres().reshape(-1, 3))
+def open_to_the_field(evidence: RayEvidence, settings: UncertaintySettings) -> np.ndarray:
+    """(X, Y, Z) bool, voxels of which the field's opinion matters: some two thirds of a volume may go without.
+
+    Where no ray went, nothing that is computed depends on it; in space that rays surely found free it is masked. The
+    voxels next to all others are asked too, for the gradient of the SDF.
+    """
+    unseen = (evidence.free + evidence.hit == 0).view(np.uint8)
+    surely_free = (occupancy.attention(evidence, settings) < MASKED).view(np.uint8)
+    settled = [minimum_filter(a, size=3, mode="nearest") for a in (unseen, surely_free)]
+    return (settled[0] | settled[1]) == 0
+
+
+def _query(
+    grid: VoxelGrid, field_query: FieldQuery, previous: UncertaintyVolume | None, mask: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """SDF and sigma at the centres of the voxels in `mask`, m, elsewhere the SDF of `previous`; without one, of all."""
+    if previous is None:
+        mask = np.ones(grid.shape, bool)
+    points = grid.centres()[mask]
+    values = field_query(points)
     out = []
     for name, value in zip(("sdf", "sigma"), values, strict=True):
-        a = np.asarray(value, dtype=np.float32)
-        if a.size != grid.size:
-            raise InputError(f"uncertainty: the field returned {a.size} values of {name}, expected {grid.size}")
+        a = np.asarray(value, dtype=np.float32).ravel()
+        if a.size != len(points):
+            raise InputError(f"uncertainty: the field returned {a.size} values of {name}, expected {len(points)}")
         if not np.isfinite(a).all():
             raise NumericalError(f"uncertainty: {name} of the field holds NaN or infinite values")
-        out.append(a.reshape(grid.shape))
-    return out[0], out[1]
+        out.append(a)
+    sdf = np.zeros(grid.shape, np.float32) if previous is None else previous["sdf"].copy()
+    sigma = np.zeros(grid.shape, np.float32)
+    sdf[mask], sigma[mask] = out
+    return sdf, sigma
 
 
 def _check_grid(grid: VoxelGrid, previous: UncertaintyVolume | None) -> None:

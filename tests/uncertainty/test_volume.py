@@ -17,6 +17,7 @@ from uncertainty_room import (
 from active3d_pipe.errors import InputError, NumericalError
 from active3d_pipe.geometry import projection
 from active3d_pipe.structures import VOLUMES, GaussianModel, VoxelGrid
+from active3d_pipe.uncertainty import volume as volume_module
 from active3d_pipe.uncertainty.config import UncertaintySettings
 from active3d_pipe.uncertainty.volume import compute_volume, make_grid
 
@@ -79,6 +80,31 @@ def test_unseen_space_is_uncertain_and_seen_free_space_is_not(seen):
     assert seen["u_final"][unseen].min() > 5 * seen["u_final"][free].max()
     assert (seen["occupancy"][unseen] == 0.5).all()
     assert seen["occupancy"][free].max() < 0.05
+
+
+def test_the_field_is_asked_only_where_its_answer_matters(seen):
+    """A second round asks for a part of the volume; a field that answers otherwise elsewhere changes nothing."""
+    asked = []
+
+    def counting(points):
+        asked.append(len(points))
+        return field(points)
+
+    # Often enough the same look that most of the seen free space is sure.
+    again = frames(LOOKS * 4)
+    plain = volume(again, seen, query=counting)
+    assert asked[0] < 0.7 * GRID.size
+
+    def whole(grid, query, previous, mask):
+        return ask(grid, query, None, mask)
+
+    ask, module = volume_module._query, volume_module
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "_query", whole)
+        full = volume(again, seen)
+    for name in VOLUMES:
+        if name != "sdf":
+            np.testing.assert_allclose(plain[name], full[name], atol=module.MASKED, err_msg=name)
 
 
 def test_seen_surface_is_occupied_and_sure(seen):
