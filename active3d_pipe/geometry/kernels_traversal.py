@@ -18,7 +18,7 @@ ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 
 @njit(fastmath=True, cache=True)
 def entry_parameter(px, py, pz, dx, dy, dz, nx, ny, nz):
-    """Smallest t >= 0 at which the ray is inside the box, or -1 when it never is."""
+    """Smallest t >= 0 at which the ray is inside the box, or -1 when it never is, or only touches it from outside."""
     t0, t1 = ZERO, FAR
     for axis in range(3):
         p = px if axis == 0 else (py if axis == 1 else pz)
@@ -32,7 +32,7 @@ def entry_parameter(px, py, pz, dx, dy, dz, nx, ny, nz):
         if a > b:
             a, b = b, a
         t0, t1 = max(t0, a), min(t1, b)
-    return t0 if t0 <= t1 else np.float32(-1.0)
+    return t0 if t0 < t1 else np.float32(-1.0)
 
 
 @njit(fastmath=True, cache=True, inline="always")

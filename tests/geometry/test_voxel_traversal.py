@@ -2,7 +2,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from active3d_pipe.errors import InputError
@@ -36,6 +36,7 @@ coordinate = st.floats(-3, 10, allow_nan=False, width=32)
 
 @settings(deadline=None, max_examples=150)
 @given(st.tuples(coordinate, coordinate, coordinate), st.integers(0, 10**6), st.floats(0.1, 15))
+@example((1.0, 0.0, 0.0), 0, 1.0)  # starts on an edge of the box and leads away from it
 def test_walk_crosses_what_the_reference_crosses(origin, seed, length):
     rng = np.random.default_rng(seed)
     opaque = rng.random(SHAPE) < 0.1
