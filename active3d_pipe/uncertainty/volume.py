@@ -63,13 +63,14 @@ def compute_volume(  # noqa: PLR0913  (the inputs of the stage, by name)
     fresh = integrate_depth(grid, new_frames, settings)
     evidence = before.joined(fresh)
 
-    sdf, sigma = _query(grid, field_query, previous, open_to_the_field(evidence, settings))
+    not_free = occupancy.attention(evidence, settings)
+    sdf, sigma = _query(grid, field_query, previous, open_to_the_field(evidence, not_free))
     observed = occupancy.observation(evidence, settings)
     vain = looks_in_vain(grid, new_frames, evidence.hit > 0, settings)
     if previous is not None:
         vain = vain + previous["vain_looks"]
     open_share = occupancy.resolvable(vain, observed, settings)
-    attention = open_share * occupancy.attention(evidence, settings)
+    attention = open_share * not_free
     support = implicit.cube_support(sdf, grid.voxel_size)
     p_imp = implicit.implicit_occupancy(sdf, sigma, observed, support, settings)
     log_odds = occupancy.explicit_log_odds(evidence, occupancy.opacity_mass(grid, gaussians), settings)
@@ -135,14 +136,14 @@ def revealed_rows(
     return rows, residual[revealed]
 
 
-def open_to_the_field(evidence: RayEvidence, settings: UncertaintySettings) -> np.ndarray:
+def open_to_the_field(evidence: RayEvidence, not_free: np.ndarray) -> np.ndarray:
     """(X, Y, Z) bool, voxels of which the field's opinion matters: some two thirds of a volume may go without.
 
     Where no ray went, nothing that is computed depends on it; in space that rays surely found free it is masked. The
-    voxels next to all others are asked too, for the gradient of the SDF.
+    voxels next to all others are asked too, for the gradient of the SDF. `not_free` is `occupancy.attention`.
     """
     unseen = (evidence.free + evidence.hit == 0).view(np.uint8)
-    surely_free = (occupancy.attention(evidence, settings) < MASKED).view(np.uint8)
+    surely_free = (not_free < MASKED).view(np.uint8)
     settled = [minimum_filter(a, size=3, mode="nearest") for a in (unseen, surely_free)]
     return (settled[0] | settled[1]) == 0
 
