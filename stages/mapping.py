@@ -24,7 +24,6 @@ def _run(context: StageContext) -> None:
     from active3d_pipe.mapping.extent import first_box
     from active3d_pipe.mapping.hybrid_map import HybridMap
     from active3d_pipe.mapping.update import update_map
-    from active3d_pipe.storage import volumes
     from active3d_pipe.storage.files import write_json
 
     config, k = context.config, context.round
@@ -37,7 +36,7 @@ def _run(context: StageContext) -> None:
         volume = None
     else:
         hybrid = shared.load_map(context.input("mapping", k - 1), context.inputs, config)
-        volume = volumes.read_volume(context.input("uncertainty", k - 1) / shared.VOLUME_NAME)
+        volume = shared.load_volume(context.input("uncertainty", k - 1))
     context.timings["reading the map"] = time.perf_counter() - start
     if volume is not None and known is None:
         start = time.perf_counter()

@@ -43,7 +43,6 @@ def _parameters(config: Any, inputs: Mapping[NodeId, Path]) -> dict[str, Any]:
 def _run(context: StageContext) -> None:
     from active3d_pipe.planning.policies.context import PolicyContext
     from active3d_pipe.planning.policies.registry import make_policy
-    from active3d_pipe.storage import volumes
     from active3d_pipe.storage.files import read_json, write_json
     from active3d_pipe.storage.poses import read_poses
     from active3d_pipe.structures import Camera, Decision
@@ -54,7 +53,7 @@ def _run(context: StageContext) -> None:
         previous = Decision.from_json(read_json(context.input("planning", k - 1) / shared.DECISION_NAME))
     decision = make_policy(settings.policy).decide(
         PolicyContext(
-            volume=volumes.read_volume(context.input("uncertainty", k) / shared.VOLUME_NAME),
+            volume=shared.load_volume(context.input("uncertainty", k)),
             walked_poses=shared.walked_poses(context.inputs, k),
             camera=Camera(**shared.load_rig(context.inputs)["camera"]),
             motion=context.config.motion,

@@ -1,5 +1,6 @@
 """What several stages need: cached frames, cached simulator, the map on disk."""
 
+import json
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,7 +14,7 @@ from active3d_pipe.pipeline.stage import NodeId
 if TYPE_CHECKING:
     from active3d_pipe.mapping.hybrid_map import HybridMap
     from active3d_pipe.sim.simulator import Simulator
-    from active3d_pipe.structures import Camera, Frame
+    from active3d_pipe.structures import Camera, Frame, UncertaintyVolume
 
 LOG_NAME, CAPTURE_NAME, DECISION_NAME = "frames.mcap", "capture.json", "decision.json"
 VOLUME_NAME, SURFACE_NAME = "volume.zarr", "surface.ply"
@@ -22,8 +23,10 @@ CACHE_BYTES = 1 << 29  # decoded frames kept in memory between the stages of one
 _frames: "OrderedDict[tuple, list[Frame]]" = OrderedDict()
 _simulators: "dict[str, Simulator]" = {}
 # What this process wrote last, and the map before it (to look at only): with their files' identity, at most one each.
+# Nobody changes a volume that was read.
 _newest_map: "list[tuple[tuple, HybridMap]]" = []
 _previous_map: "list[tuple[tuple, HybridMap]]" = []
+_newest_volume: "list[tuple[tuple, UncertaintyVolume]]" = []
 MAP_NAMES = ("field.safetensors", "gaussians.safetensors", "optimiser.safetensors", "keyframes.json")
 
 
@@ -139,6 +142,29 @@ def _block_centres(depth: np.ndarray, stride: int) -> np.ndarray:
 def walked_poses(inputs: Mapping[NodeId, Path], last_round: int) -> np.ndarray:
     """(M, 4, 4) poses of every captured frame, in order."""
     return np.concatenate([np.array(read_capture(inputs[node])["poses"]) for node in captures(last_round)])
+
+
+def save_volume(folder: Path, volume: "UncertaintyVolume") -> None:
+    """Write the volume of a round, and keep it in memory as it will be read."""
+    from dataclasses import replace
+
+    from active3d_pipe.storage.volumes import write_volume
+
+    write_volume(folder / VOLUME_NAME, volume)
+    _newest_volume[:] = [(_volume_identity(folder), replace(volume, fusion=json.loads(json.dumps(volume.fusion))))]
+
+
+def load_volume(folder: Path) -> "UncertaintyVolume":
+    """Read the volume of a round; the one that this process wrote last is taken from memory."""
+    from active3d_pipe.storage.volumes import read_volume
+
+    if _newest_volume and _newest_volume[0][0] == _volume_identity(folder):
+        return _newest_volume[0][1]
+    return read_volume(folder / VOLUME_NAME)
+
+
+def _volume_identity(folder: Path) -> tuple:
+    return _identity(sorted(path for path in (folder / VOLUME_NAME).rglob("*") if path.is_file()))
 
 
 def save_map(folder: Path, hybrid: "HybridMap", *, to_train: bool = True) -> None:

@@ -52,7 +52,6 @@ def examined_frames(
 def _run(context: StageContext) -> None:
     import numpy as np
 
-    from active3d_pipe.storage import volumes
     from active3d_pipe.storage.files import read_json
     from active3d_pipe.uncertainty.growth import grown_grid, on_grid
     from active3d_pipe.uncertainty.volume import compute_volume, make_grid
@@ -66,7 +65,7 @@ def _run(context: StageContext) -> None:
     context.timings["reading the map"] = time.perf_counter() - start
     previous, predicted = None, []
     if k > 0:
-        previous = volumes.read_volume(context.input("uncertainty", k - 1) / shared.VOLUME_NAME)
+        previous = shared.load_volume(context.input("uncertainty", k - 1))
         margin = config.uncertainty.margin_m
         grid = grown_grid(previous.grid, low - margin, high + margin)
         previous = on_grid(previous, grid)
@@ -82,7 +81,7 @@ def _run(context: StageContext) -> None:
         settings=config.uncertainty,
     )
     context.timings["volume"] = time.perf_counter() - start
-    volumes.write_volume(context.out / shared.VOLUME_NAME, volume)
+    shared.save_volume(context.out, volume)
     _write_surface(context, hybrid, volume)
     observed = volume.observed
     context.notes.update(

@@ -3,11 +3,13 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from active3d_pipe.geometry import projection, se3
 from active3d_pipe.mapping.config import KeyframeSettings
+from active3d_pipe.mapping.kernels_overlap import seen_share
 from active3d_pipe.structures import Camera, Frame, UncertaintyVolume
 
 OVERLAP_STRIDE = 24  # px between the depth samples that measure frustum overlap
@@ -38,22 +40,24 @@ class Keyframe:
 def depth_samples(frame: Frame, stride: int = OVERLAP_STRIDE) -> np.ndarray:
     """(N, 3) float64 world points of a sparse grid of valid depth pixels."""
     depth = frame.depth[stride // 2 :: stride, stride // 2 :: stride]
-    rays = projection.pixel_rays(frame.camera)[stride // 2 :: stride, stride // 2 :: stride]
+    rays = _sparse_rays(frame.camera, stride)
     valid = depth > 0
     return se3.transform_points(frame.T_world_camera, (rays * depth[..., None])[valid].astype(np.float64))
+
+
+@lru_cache(maxsize=4)
+def _sparse_rays(camera: Camera, stride: int) -> np.ndarray:
+    """Every `stride`-th pixel's ray, the same for all frames of a camera."""
+    return projection.pixel_rays(camera)[stride // 2 :: stride, stride // 2 :: stride].copy()
 
 
 def overlap(points_world: np.ndarray, other: Frame) -> float:
     """Share of points that `other` sees: inside its image and not behind its depth."""
     if len(points_world) == 0:
         return 0.0
-    uv, z = projection.project(points_world, other.T_world_camera, other.camera)
-    inside = projection.in_image(uv, z, other.camera)
-    seen = np.zeros(len(z), bool)
-    ij = np.floor(uv[inside]).astype(int)
-    observed = other.depth[ij[:, 1], ij[:, 0]]
-    seen[inside] = (observed > 0) & (z[inside] < observed * (1 + OCCLUSION_TOLERANCE))
-    return float(seen.mean())
+    c = other.camera
+    T_camera_world = se3.inverse(other.T_world_camera)
+    return seen_share(points_world, T_camera_world, c.fx, c.fy, c.cx, c.cy, c.near, other.depth, OCCLUSION_TOLERANCE)
 
 
 def horizontal_fov(camera: Camera) -> float:

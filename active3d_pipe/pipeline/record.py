@@ -6,6 +6,7 @@ digest of all the others, so that damage to the record itself is found as well.
 
 import json
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -18,6 +19,7 @@ from active3d_pipe.pipeline.stage import NodeId
 RECORD = "record.json"
 PRUNED = "pruned.json"
 SCHEMA = "active3d.record/1"
+HASHING_THREADS = 2  # hashing lets other threads run
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,13 +105,16 @@ def _safe(name: str) -> str:
 
 def measure(folder: Path) -> dict[str, FileEntry]:
     """Digest and size of every file of a folder; symbolic links and special files are refused."""
-    files: dict[str, FileEntry] = {}
-    for path in list_files(folder):
-        name = path.relative_to(folder).as_posix()
+    paths = list_files(folder)
+    for path in paths:
         if path.is_symlink() or not path.is_file():
             raise ArtifactError(f"{path}: an artifact may hold plain files only")
-        files[name] = FileEntry(sha256_file(path), path.stat().st_size)
-    return files
+    with ThreadPoolExecutor(HASHING_THREADS) as pool:
+        digests = pool.map(sha256_file, paths)
+        return {
+            path.relative_to(folder).as_posix(): FileEntry(digest, path.stat().st_size)
+            for path, digest in zip(paths, digests, strict=True)
+        }
 
 
 def read_record(folder: Path) -> Record | None:

@@ -15,7 +15,7 @@ import numpy as np
 from active3d_pipe import __version__
 from active3d_pipe.errors import ArtifactError
 from active3d_pipe.geometry import se3
-from active3d_pipe.storage.files import reading, writing
+from active3d_pipe.storage.files import COMPRESSION_THREADS, reading, writing
 from active3d_pipe.storage.png import decode_png, encode_png
 from active3d_pipe.structures import Camera, Frame
 
@@ -23,7 +23,6 @@ COLOR, DEPTH, CALIBRATION = "/camera/color/image", "/camera/depth/image", "/came
 DEPTH_CALIBRATION, TRANSFORMS, POSE, PATH = "/camera/depth/calibration", "/tf", "/camera/pose", "/plan/path"
 WORLD, OPTICAL = "world", "camera_optical"
 STEP_NS = 100_000_000  # simulated duration of a step
-_THREADS = 2  # for compression, which lets other threads run; the bytes do not depend on it
 
 
 def write_frames(path: Path, frames: Sequence[Frame], planned_path: np.ndarray) -> None:
@@ -41,7 +40,7 @@ def write_frames(path: Path, frames: Sequence[Frame], planned_path: np.ndarray) 
         COLOR: CompressedImage, DEPTH: RawImage, CALIBRATION: CameraCalibration, DEPTH_CALIBRATION: CameraCalibration,
         TRANSFORMS: FrameTransforms, POSE: PoseInFrame, PATH: PosesInFrame,
     }
-    with writing(path), path.open("wb") as stream, ThreadPoolExecutor(_THREADS) as pool:
+    with writing(path), path.open("wb") as stream, ThreadPoolExecutor(COMPRESSION_THREADS) as pool:
         images = pool.map(encode_png, [frame.rgb for frame in frames])  # in order, ahead of the chunks' compression
         writer = Writer(stream, compression=CompressionType.ZSTD, enable_crcs=True)
         # Set by ourselves: the default names the library's version, and an upgrade would change the bytes.
@@ -96,7 +95,7 @@ def read_frames(path: Path) -> list[Frame]:
         for step in steps:
             if set(messages[step]) != set(types):
                 raise ArtifactError(f"{path}: step {step} has {sorted(messages[step])}, expected {sorted(types)}")
-        with ThreadPoolExecutor(_THREADS) as pool:
+        with ThreadPoolExecutor(COMPRESSION_THREADS) as pool:
             images = pool.map(decode_png, [messages[step][COLOR].data for step in steps])
             return [
                 _frame(step, stamps[step], messages[step], image, near, far)

@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 
 from active3d_pipe.errors import ArtifactError
-from active3d_pipe.storage.files import reading, writing
+from active3d_pipe.storage.files import COMPRESSION_THREADS, reading, writing
 from active3d_pipe.structures import VOLUMES, UncertaintyVolume, VoxelGrid
 from active3d_pipe.structures.uncertainty_volume import ZERO_BY_DEFAULT
 
 GROUP = "scale0"
 MAX_VOXELS = 2**31
-_THREADS = 2  # for compression, which lets other threads run; the bytes do not depend on it
 
 
 def write_volume(path: Path, volume: UncertaintyVolume) -> None:
@@ -46,7 +45,7 @@ def write_volume(path: Path, volume: UncertaintyVolume) -> None:
             )
             array[...] = volume[name][None]
 
-        with ThreadPoolExecutor(_THREADS) as pool:
+        with ThreadPoolExecutor(COMPRESSION_THREADS) as pool:
             list(pool.map(write, VOLUMES))
         _write_axis(group, "round", np.array([volume.round], np.int64), "1", codec)
         for i, axis in enumerate("xyz"):

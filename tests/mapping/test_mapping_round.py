@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 from room_with_ball import HIGH, LOW, render
 
-from active3d_pipe.geometry import se3
+from active3d_pipe.geometry import projection, se3
 from active3d_pipe.mapping.config import MappingSettings
 from active3d_pipe.mapping.hybrid_map import HybridMap
-from active3d_pipe.mapping.keyframes import Keyframe, depth_samples, divergence, select_keyframes, view_distance
+from active3d_pipe.mapping.keyframes import (
+    Keyframe, depth_samples, divergence, overlap, select_keyframes, view_distance,
+)
 from active3d_pipe.mapping.refine import refine
 from active3d_pipe.mapping.update import update_map
 from active3d_pipe.mapping.window import choose_window, draw_older
@@ -53,6 +55,22 @@ def test_divergence_is_the_least_view_distance() -> None:
         assert divergence(frame, known) == pytest.approx(slow, abs=1e-12)
     assert divergence(known[3].frame, known, enough=0.2) <= 0.2
     assert divergence(known[3].frame, []) == 1.0
+
+
+def test_overlap_is_the_share_of_points_in_front_of_the_depth_of_the_other_view() -> None:
+    points = depth_samples(render(CAMERA, pose(0.0)), 3)
+    shares = []
+    for turn in (0.0, 20.0, 45.0, 180.0):
+        other = render(CAMERA, pose(turn, (-0.3, 0.5, 1.0)))
+        uv, z = projection.project(points, other.T_world_camera, CAMERA)
+        inside = projection.in_image(uv, z, CAMERA)
+        column, row = np.floor(uv[inside]).astype(int).T
+        reading = other.depth[row, column]
+        slow = np.sum((reading > 0) & (z[inside] < 1.1 * reading)) / len(points)
+        shares.append(overlap(points, other))
+        assert shares[-1] == pytest.approx(slow, abs=1e-12)
+    assert shares[0] > shares[1] > shares[2] > shares[3]
+    assert overlap(points[:0], render(CAMERA, pose(0.0))) == 0.0
 
 
 def test_select_keyframes_takes_what_diverges_and_nothing_twice() -> None:
