@@ -9,6 +9,7 @@ import numpy as np
 from active3d_pipe.geometry import se3
 from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.free_space import FreeSpace
+from active3d_pipe.planning.kernels_candidates import best_of_blocks
 from active3d_pipe.structures.camera import Camera
 
 # Rays of the sphere: rows of elevation x columns of azimuth, 7.5 degrees apart.
@@ -66,14 +67,11 @@ def coarse_positions(space: FreeSpace, settings: PlanningSettings) -> np.ndarray
 
     Blocks have the coarse spacing, or the smallest multiple of it at which there are at most `max_positions`.
     """
-    spacing, voxel = settings.coarse_spacing_m, space.grid.voxel_size
-    ijk = np.argwhere(space.reachable)
+    spacing, reachable = settings.coarse_spacing_m, space.reachable
     while True:
-        block = max(1, round(spacing / voxel))
-        occupied = np.zeros(np.asarray(space.grid.shape) // block + 1, bool)
-        occupied[tuple((ijk // block).T)] = True
-        if occupied.sum() <= settings.max_positions:
-            return _thin(ijk, space, block * voxel)
+        found = _thin(reachable, space, spacing)
+        if len(found) <= settings.max_positions:
+            return found
         spacing *= 1.2
 
 
@@ -86,18 +84,10 @@ def fine_positions(space: FreeSpace, around: np.ndarray, settings: PlanningSetti
     for v in around:
         low = np.maximum(v - reach, 0)
         near[tuple(slice(a, b) for a, b in zip(low, v + reach + 1, strict=True))] = True
-    return _thin(np.argwhere(near & space.reachable), space, settings.fine_spacing_m)
+    return _thin(near & space.reachable, space, settings.fine_spacing_m)
 
 
-def _thin(ijk: np.ndarray, space: FreeSpace, spacing_m: float) -> np.ndarray:
-    """One voxel of every cubic block: most clearance first, then nearest to the block's middle, then lowest id."""
-    if len(ijk) == 0:
-        return ijk
+def _thin(allowed: np.ndarray, space: FreeSpace, spacing_m: float) -> np.ndarray:
+    """(P, 3) int64, one allowed voxel of every cubic block (`best_of_blocks`)."""
     block = max(1, round(spacing_m / space.grid.voxel_size))
-    cell = ijk // block
-    shape = np.asarray(space.grid.shape) // block + 1
-    key = (cell[:, 0] * shape[1] + cell[:, 1]) * shape[2] + cell[:, 2]
-    off_centre = np.abs(ijk - (cell * block + (block - 1) / 2)).sum(axis=1)
-    order = np.lexsort((off_centre, -space.risk.clearance_m[tuple(ijk.T)], key))
-    first = np.unique(key[order], return_index=True)[1]
-    return ijk[order[first]]
+    return best_of_blocks(allowed.view(np.uint8), space.risk.clearance_m, block)

@@ -4,12 +4,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 from active3d_pipe.information.gain import GainTerms
 from active3d_pipe.planning.candidates import Directions, coarse_positions, fine_positions, view_directions
 from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.free_space import FreeSpace
+from active3d_pipe.planning.kernels_candidates import spread
 from active3d_pipe.planning.reward import RewardField, exact_terms, sphere_rewards
 from active3d_pipe.planning.targets import target_positions
 from active3d_pipe.structures.camera import Camera
@@ -179,11 +179,11 @@ def reward_density(pool: Pool, space: FreeSpace) -> np.ndarray:
 
     Spread from the scored positions with a Gaussian of half a metre; 0 far away from all of them.
     """
-    total, weight = np.zeros(space.grid.shape, np.float32), np.zeros(space.grid.shape, np.float32)
-    index = tuple(pool.positions.T)
-    total[index], weight[index] = pool.best_rewards, 1
     sigma = 0.35 / space.grid.voxel_size
-    total, weight = (gaussian_filter(a, sigma, mode="constant", truncate=2.0) for a in (total, weight))
+    reach = np.arange(round(2 * sigma) + 1)
+    half = np.exp(-0.5 * (reach / sigma) ** 2)
+    kernel = np.concatenate([half[:0:-1], half]).astype(np.float32)
+    total, weight = spread(pool.positions, pool.best_rewards, kernel / kernel.sum(), space.grid.shape)
     out = np.where(weight > 1e-6, total / np.maximum(weight, 1e-6), 0)
     return (out / max(float(out.max()), 1e-9)).astype(np.float32)
 

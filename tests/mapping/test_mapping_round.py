@@ -8,7 +8,12 @@ from active3d_pipe.geometry import projection, se3
 from active3d_pipe.mapping.config import MappingSettings
 from active3d_pipe.mapping.hybrid_map import HybridMap
 from active3d_pipe.mapping.keyframes import (
-    Keyframe, depth_samples, divergence, overlap, select_keyframes, view_distance,
+    Keyframe,
+    depth_samples,
+    divergence,
+    overlap,
+    select_keyframes,
+    view_distance,
 )
 from active3d_pipe.mapping.refine import refine
 from active3d_pipe.mapping.update import update_map

@@ -1,11 +1,13 @@
 import box_world
 import numpy as np
 import pytest
+from scipy.ndimage import correlate1d
 
 from active3d_pipe.geometry import se3
 from active3d_pipe.planning.candidates import coarse_positions, fine_positions, view_directions
 from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.free_space import build_free_space, clearance, mark_body
+from active3d_pipe.planning.kernels_candidates import best_of_blocks, spread
 from active3d_pipe.planning.risk_field import joint_occupancy
 from active3d_pipe.structures import Camera, VoxelGrid
 from active3d_pipe.structures.motion import MotionSettings
@@ -116,6 +118,36 @@ def test_candidates_cover_all_reachable_space(seen):
     fine = fine_positions(space, coarse[:2], SETTINGS)
     assert space.reachable[tuple(fine.T)].all()
     assert np.abs(fine - coarse[0]).max(axis=1).min() <= 5
+
+
+def test_best_of_blocks_is_the_clearest_then_the_middle_then_the_first():
+    rng = np.random.default_rng(3)
+    allowed = (rng.random((11, 7, 6)) < 0.3).astype(np.uint8)
+    clearance = rng.integers(0, 3, allowed.shape).astype(np.float32)
+    for block in (1, 2, 3, 5):
+        slow: dict[tuple, tuple] = {}
+        for v in map(tuple, np.argwhere(allowed).tolist()):
+            away = sum(abs(c % block - (block - 1) / 2) for c in v)
+            rank = (-clearance[v], away, v)
+            key = tuple(c // block for c in v)
+            slow[key] = min(slow.get(key, rank), rank)
+        found = best_of_blocks(allowed, clearance, block)
+        assert [tuple(v) for v in found.tolist()] == [slow[key][2] for key in sorted(slow)]
+    assert best_of_blocks(np.zeros((3, 3, 3), np.uint8), np.zeros((3, 3, 3), np.float32), 2).shape == (0, 3)
+
+
+def test_spread_is_a_truncated_filter_over_sparse_values():
+    shape = (12, 9, 8)
+    positions = np.array([[0, 0, 0], [6, 4, 3], [11, 8, 7], [6, 5, 3]])
+    values = np.array([2.0, 1.0, 5.0, 0.5], np.float32)
+    kernel = np.array([0.1, 0.2, 0.4, 0.2, 0.1], np.float32)
+    total, weight = spread(positions, values, kernel, shape)
+    for found, source in ((total, values), (weight, np.ones(4, np.float32))):
+        dense = np.zeros(shape, np.float64)
+        dense[tuple(positions.T)] = source
+        for axis in range(3):
+            dense = correlate1d(dense, kernel.astype(np.float64), axis=axis, mode="constant")
+        np.testing.assert_allclose(found, dense, atol=1e-6)
 
 
 def test_views_hold_the_rays_in_their_frustum():
