@@ -60,7 +60,7 @@ class MappingSettings(Settings):
     )
     gaussian_iterations_per_step: float = Field(0.5, ge=0, description="rasteriser iterations for every captured frame")
     field_iterations_per_step: float = Field(0.25, ge=0, description="field iterations for every captured frame")
-    gaussian_iterations_per_keyframe: float = Field(2.5, ge=0, description="and for every keyframe")
+    gaussian_iterations_per_keyframe: float = Field(1.5, ge=0, description="and for every keyframe")
     field_iterations_per_keyframe: float = Field(0.75, ge=0, description="and for every keyframe")
     first_round_factor: float = Field(1.5, gt=0, description="iterations of round 0 are multiplied by this")
     coupling_every: int = Field(10, ge=1, description="E_geo is applied on every n-th Gaussian iteration")

@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """How much of one view another one sees: a kernel, since every frame is compared with many keyframes."""
 
 from numba import njit
