@@ -1,6 +1,6 @@
 """Are the planner's views good for rendering too? Its keyframes against as many random views of free space.
 
-    python benchmarks/view_choice.py RUN [RUN ...] [--iterations N] [--threads N]
+    python benchmarks/view_choice.py RUN [RUN ...] [--iterations N]
 
 Both sets go through the same mapper from nothing, in rounds of ten, every view a keyframe, then through the same
 refinement over those views alone; judged on the evaluation's held-out views. Random views are drawn as the held-out
@@ -19,7 +19,6 @@ from active3d_pipe.mapping import branches
 from active3d_pipe.mapping.hybrid_map import HybridMap
 from active3d_pipe.mapping.refine import refine
 from active3d_pipe.mapping.update import update_map
-from active3d_pipe.pipeline.threads import set_threads
 from active3d_pipe.sim.observable import held_out_poses
 from active3d_pipe.structures import Frame
 
@@ -72,10 +71,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument("--iterations", type=int, default=1000, help="of the refinement")
-    parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0, help="of the random views")
     given = parser.parse_args()
-    set_threads(given.threads)
     print("| scene | views | of | held-out dB | SSIM | train dB | Gaussians |")
     print("|---|---|---|---|---|---|---|", flush=True)
     for path in given.runs:
