@@ -109,6 +109,6 @@ def _write_surface(context: StageContext, hybrid: "HybridMap", volume: "Uncertai
 
 
 STAGE = Stage(
-    name="uncertainty", version=5, config=("uncertainty", "mapping", "export.preview_voxel_m"),
+    name="uncertainty", version=6, config=("uncertainty", "mapping", "export.preview_voxel_m"),
     inputs=_inputs, run=_run, loop=True,
 )

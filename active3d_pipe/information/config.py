@@ -4,6 +4,8 @@ from pydantic import Field
 
 from active3d_pipe.structures.settings import Settings
 
+SETTLED_RAYS = 3.0
+
 
 class InformationSettings(Settings):
     """Weights and the observation model of the expected information gain."""
@@ -16,7 +18,7 @@ class InformationSettings(Settings):
     residual_bits: float = Field(
         0.1, ge=0, le=1, description="entropy that a voxel keeps, per branch, after it has been seen, bits"
     )
-    settled_rays: float = Field(3.0, gt=0, description="depth rays after which a voxel counts as seen")
+    settled_rays: float = Field(SETTLED_RAYS, gt=0, description="depth rays after which a voxel counts as seen")
     reference_footprint_m: float = Field(
         0.005, gt=0, description="width of a pixel on a frontal surface at which a look has quality 1, m (the scale of "
         "the volume view_quality)"

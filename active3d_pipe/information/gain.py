@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from active3d_pipe.information.config import InformationSettings
+from active3d_pipe.information.config import SETTLED_RAYS, InformationSettings
 from active3d_pipe.structures.camera import Camera
 
 FREE, OPEN, SURFACE = 0, 1, 2
@@ -78,14 +78,20 @@ def classify(arrays: Mapping[str, np.ndarray], settings: InformationSettings) ->
     return np.where(surface, SURFACE, np.where(seen_free, FREE, OPEN)).astype(np.uint8)
 
 
-def entropy_drop(before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]) -> tuple[float, float]:
-    """(field's, Gaussians') entropy, bits, lost between two volumes of one run on one grid, where rays went meanwhile.
+def entropy_drop(
+    before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray], settled_rays: float = SETTLED_RAYS
+) -> tuple[float, float]:
+    """(field's, Gaussians') entropy, bits, lost between two volumes of one run on one grid, where looks showed anew.
 
-    Elsewhere the field's entropy drifts by thousands of bits with its training: no outcome of the looks.
+    That is where rays went meanwhile, into voxels that fewer than `settled_rays` had reached before or whose surface
+    they saw better than any look had: the voxels that a prediction speaks of. Elsewhere the field's entropy drifts by
+    thousands of bits with its training: no outcome of the looks.
     """
+    rays = before["free_evidence"] + before["hit_evidence"]
     reached = (after["free_evidence"] != before["free_evidence"]) | (after["hit_evidence"] != before["hit_evidence"])
+    anew = reached & ((rays < settled_rays) | (after["view_quality"] > before["view_quality"]))
     imp, exp = (
-        float((before[name] - after[name])[reached].sum(dtype=np.float64)) for name in ("entropy_imp", "entropy_exp")
+        float((before[name] - after[name])[anew].sum(dtype=np.float64)) for name in ("entropy_imp", "entropy_exp")
     )
     return imp, exp
 

@@ -2,8 +2,8 @@
 
 The prediction is Delta I of eq. nbv_eig over everything that the poses of the executed path will see, each voxel
 once, at the best of the looks that it gets. The outcome is the drop of each branch's entropy from the volume of
-the decision to the next one, over the voxels that rays reached meanwhile. The ratio of both over the past decisions
-corrects the next prediction.
+the decision to the next one, over the voxels of which rays showed something new meanwhile. The ratio of both over the
+past decisions corrects the next prediction.
 """
 
 from dataclasses import dataclass

@@ -39,8 +39,8 @@ class UncertaintyVolume:
         arrays: one array for every name in `VOLUMES`.
         fusion: what evidence maximisation found: `alphas` (3,), `evidence`, `noise`, and the running
             statistics it needs next round, as plain JSON values.
-        drop_bits: (field's, Gaussians') entropy lost since the volume before, bits, over the voxels that rays of this
-            round reached; None when there is none before.
+        drop_bits: (field's, Gaussians') entropy lost since the volume before, bits, over the voxels of which rays of
+            this round showed something new (`information.gain.entropy_drop`); None when there is none before.
     """
 
     grid: VoxelGrid

@@ -1,4 +1,4 @@
-"""What a decision brought: entropy lost where rays went, neither by growth of the grid nor by drift elsewhere."""
+"""What a decision brought: entropy lost where looks showed something new, not by growth of the grid, not by drift."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from active3d_pipe.uncertainty.growth import grown_grid, on_grid
 
 @pytest.fixture
 def volumes():
-    """Before and after a round that reached a quarter of the voxels, and which voxels these are."""
+    """Before and after a round that reached a quarter of the voxels, and of which of them it showed something new."""
     grid, rng = VoxelGrid.from_bounds([0, 0, 0], [2, 2, 1], 0.1), np.random.default_rng(0)
     arrays = {name: rng.random(grid.shape, np.float32) for name in VOLUMES}
     reached = rng.random(grid.shape) < 0.25
@@ -23,18 +23,24 @@ def volumes():
         "entropy_exp": np.where(reached, 0, 1).astype(np.float32),
         "free_evidence": arrays["free_evidence"] + (reached & (rng.random(grid.shape) < 0.5)),
     }
+    # Looks at what was settled that show it no better than before.
+    nothing_new = reached & (rng.random(grid.shape) < 0.3)
+    arrays["hit_evidence"] = np.where(nothing_new, 5, arrays["hit_evidence"]).astype(np.float32)
+    better = nothing_new & (rng.random(grid.shape) < 0.5)
+    changed["view_quality"] = arrays["view_quality"] + np.where(better, 0.1, 0)
     changed["hit_evidence"] = arrays["hit_evidence"] + (
         reached & (changed["free_evidence"] == arrays["free_evidence"])
     )
     changed = {name: a.astype(np.float32) for name, a in changed.items()}
-    return UncertaintyVolume(grid, 0, arrays), UncertaintyVolume(grid, 1, {**arrays, **changed}), reached
+    anew = reached & ~(nothing_new & ~better)
+    return UncertaintyVolume(grid, 0, arrays), UncertaintyVolume(grid, 1, {**arrays, **changed}), anew
 
 
-def test_drift_where_no_ray_went_is_no_outcome(volumes):
-    before, after, reached = volumes
+def test_drift_where_looks_showed_nothing_new_is_no_outcome(volumes):
+    before, after, anew = volumes
     imp, exp = entropy_drop(before.arrays, after.arrays)
-    assert imp == pytest.approx(0.5 * before["entropy_imp"][reached].sum(), rel=1e-4)
-    assert exp == pytest.approx(before["entropy_exp"][reached].sum(), rel=1e-4)
+    assert imp == pytest.approx(0.5 * before["entropy_imp"][anew].sum(), rel=1e-4)
+    assert exp == pytest.approx(before["entropy_exp"][anew].sum(), rel=1e-4)
 
 
 def test_growth_is_not_counted_as_entropy_that_came_back(volumes):
