@@ -91,7 +91,7 @@ def test_predicted_gain_comes_true():
             outcome = decision.terms["previous"]
             # Nothing drifts in this world: the outcome is the drop of the whole, but for what more rays confirm.
             drop = (last["entropy_imp"] - volume["entropy_imp"]).sum()
-            assert 0.9 * drop < outcome["realised_imp"] <= 1.001 * drop
+            assert 0.7 * drop < outcome["realised_imp"] <= 1.001 * drop
             pairs.append((outcome["predicted_imp"], outcome["realised_imp"]))
         last = volume
     predicted, realised = np.array(pairs).T
