@@ -17,7 +17,8 @@ CURVE_ROUNDS = 16  # rounds whose surfaces are measured for the curves over step
 
 
 def _inputs(last_round: int) -> tuple[NodeId, ...]:
-    surfaces = tuple(NodeId("uncertainty", k) for k in spread(range(last_round + 1), CURVE_ROUNDS))
+    rounds = [k for k in range(last_round + 1) if shared.leaves_surface(k)]
+    surfaces = tuple(NodeId("uncertainty", k) for k in spread(rounds, CURVE_ROUNDS))
     return (*shared.captures(last_round), *surfaces, NodeId("export"))
 
 

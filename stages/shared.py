@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 LOG_NAME, CAPTURE_NAME, DECISION_NAME = "frames.mcap", "capture.json", "decision.json"
 VOLUME_NAME, SURFACE_NAME = "volume.zarr", "surface.ply"
+SURFACES_AT_FIRST, SURFACES_THEN = 16, 4  # the first rounds each leave a coarse surface, then every fourth
 CACHE_BYTES = 1 << 29  # decoded frames kept in memory between the stages of one process
 
 _frames: "OrderedDict[tuple, list[Frame]]" = OrderedDict()
@@ -33,6 +34,11 @@ MAP_NAMES = ("field.safetensors", "gaussians.safetensors", "optimiser.safetensor
 def captures(last_round: int) -> tuple[NodeId, ...]:
     """The capture nodes of rounds 0..last_round."""
     return tuple(NodeId("capture", k) for k in range(last_round + 1))
+
+
+def leaves_surface(round: int) -> bool:
+    """Whether a round's uncertainty artifact holds the coarse surface: of long runs the curves need a few only."""
+    return round < SURFACES_AT_FIRST or round % SURFACES_THEN == 0
 
 
 def load_frames(folder: Path) -> "list[Frame]":

@@ -82,7 +82,8 @@ def _run(context: StageContext) -> None:
     )
     context.timings["volume"] = time.perf_counter() - start
     shared.save_volume(context.out, volume)
-    _write_surface(context, hybrid, volume)
+    if shared.leaves_surface(k):
+        _write_surface(context, hybrid, volume)
     observed = volume.observed
     context.notes.update(
         coverage=round(float(observed.mean()), 5),
@@ -93,7 +94,7 @@ def _run(context: StageContext) -> None:
 
 
 def _write_surface(context: StageContext, hybrid: "HybridMap", volume: "UncertaintyVolume") -> None:
-    """The coarse surface of this round, for the curves over steps and for looking at progress."""
+    """The coarse surface of this round, for the curves over steps."""
     from active3d_pipe.export.config import MeshSettings
     from active3d_pipe.export.isosurface import extract_mesh, near_surface
     from active3d_pipe.storage import meshes
@@ -109,6 +110,6 @@ def _write_surface(context: StageContext, hybrid: "HybridMap", volume: "Uncertai
 
 
 STAGE = Stage(
-    name="uncertainty", version=6, config=("uncertainty", "mapping", "export.preview_voxel_m"),
+    name="uncertainty", version=7, config=("uncertainty", "mapping", "export.preview_voxel_m"),
     inputs=_inputs, run=_run, loop=True,
 )

@@ -61,5 +61,5 @@ class ExportSettings(Settings):
         0.3, gt=0, description="scale on the Gaussians' learning rates in that fit"
     )
     preview_voxel_m: float = Field(
-        0.08, gt=0, description="cell edge of the coarse surface written every round (curves, looking at progress), m"
+        0.08, gt=0, description="cell edge of the coarse surface behind the curves over steps, m"
     )
