@@ -25,7 +25,7 @@ class MeshSettings(Settings):
         0.004, ge=0, description="connected pieces of less area are dropped as spurious, m2"
     )
     cull_tolerance_m: float = Field(
-        0.05, gt=0, description="a face this far behind an observed depth still counts as seen, m"
+        0.03, gt=0, description="a face counts as seen where an observed depth is this near to it along the axis, m"
     )
     cull_facing_cosine: float = Field(
         0.0, ge=-1, le=1, description="a face is seen only by cameras towards which its normal has at least this cosine"

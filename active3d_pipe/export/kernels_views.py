@@ -104,7 +104,7 @@ def mark_seen(spheres, centroids, normals, rotation, centre, intrinsics, depth, 
             if u < 0 or v < 0 or u >= width or v >= height:
                 continue
             d = depth[int(v), int(u)]
-            if d <= 0 or z > d + tolerance:
+            if d <= 0 or abs(z - d) > tolerance:
                 continue
             towards = -(normals[k, 0] * dx + normals[k, 1] * dy + normals[k, 2] * dz)
             if towards >= cosine * np.sqrt(dx * dx + dy * dy + dz * dz):

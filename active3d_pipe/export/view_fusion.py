@@ -46,10 +46,11 @@ def near_readings(
 def cull_unseen(mesh: TriangleMesh, frames: Sequence[Frame], settings: MeshSettings) -> TriangleMesh:
     """Drop the faces that no frame saw, but for a margin of `cull_margin_m` around what was seen.
 
-    A frame sees a face when the face's centroid projects onto a pixel with a depth reading, lies at most
-    `cull_tolerance_m` behind that depth, and the face is turned towards the camera (`cull_facing_cosine`): the
-    field also has a zero level where it returns to free behind a surface, and that sheet looks away. The margin, in
-    whole rings of faces, is where the field continues seen surface into small gaps and behind the rims of occluders.
+    A frame sees a face when the face's centroid projects onto a pixel with a depth reading, lies within
+    `cull_tolerance_m` of that depth (a reading far behind says that there is nothing), and the face is turned towards
+    the camera (`cull_facing_cosine`): the field also has a zero level where it returns to free behind a surface, and
+    that sheet looks away. The margin, in whole rings of faces, is where the field continues seen surface into small
+    gaps and behind the rims of occluders.
     """
     if len(mesh.faces) == 0:
         return mesh

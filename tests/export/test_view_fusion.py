@@ -67,6 +67,8 @@ def test_cull_keeps_what_a_frame_saw(ball):
     # A reading in front hides everything.
     blocked = cull_unseen(ball, [frame_of(camera, T, np.where(depth > 0, 0.4, 0))], SETTINGS)
     assert len(blocked.faces) == 0
+    # Readings far behind say that nothing is there.
+    assert len(cull_unseen(ball, [frame_of(camera, T, depth + 0.1 * (depth > 0))], SETTINGS).faces) == 0
 
 
 def test_cull_agrees_with_the_slow_formula(ball):
@@ -82,8 +84,8 @@ def test_cull_agrees_with_the_slow_formula(ball):
             d = frame.depth[int(uv[1]), int(uv[0])]
             to_camera = T[:3, 3] - centroid[k]
             cosine = normal[k] @ to_camera / np.linalg.norm(normal[k]) / np.linalg.norm(to_camera)
-            expected[k] = d > 0 and z <= d + 0.05 and cosine >= 0.2
-    settings = SETTINGS.model_copy(update={"cull_facing_cosine": 0.2})
+            expected[k] = d > 0 and abs(z - d) <= 0.2 and cosine >= 0.2
+    settings = SETTINGS.model_copy(update={"cull_facing_cosine": 0.2, "cull_tolerance_m": 0.2})
     kept = cull_unseen(ball, [frame], settings)
     assert 100 < expected.sum() < 0.5 * len(expected)
     # A face exactly on a pixel border may fall either way in float32.
