@@ -10,6 +10,7 @@ from stages import shared
 
 if TYPE_CHECKING:
     from active3d_pipe.planning.policies.context import MapView
+    from active3d_pipe.structures import UncertaintyVolume
 
 
 def _inputs(round: int) -> tuple[NodeId, ...]:
@@ -53,7 +54,7 @@ def _run(context: StageContext) -> None:
         previous = Decision.from_json(read_json(context.input("planning", k - 1) / shared.DECISION_NAME))
     decision = make_policy(settings.policy).decide(
         PolicyContext(
-            volume=shared.load_volume(context.input("uncertainty", k)),
+            volume=_volume(context),
             walked_poses=shared.walked_poses(context.inputs, k),
             camera=Camera(**shared.load_rig(context.inputs)["camera"]),
             motion=context.config.motion,
@@ -69,6 +70,16 @@ def _run(context: StageContext) -> None:
     if decision.chosen >= 0:
         best = decision.ranking[decision.chosen]
         context.notes.update(gain_bits=round(best.gain_imp + best.gain_exp, 3), reward=round(best.reward, 3))
+
+
+def _volume(context: StageContext) -> "UncertaintyVolume":
+    """The volume of this round; a copy of their own for policies from outside, which may write into it."""
+    from active3d_pipe.storage.volumes import read_volume
+
+    folder = context.input("uncertainty", context.round)
+    if "policy_source" in context.parameters:
+        return read_volume(folder / shared.VOLUME_NAME)
+    return shared.load_volume(folder)
 
 
 def _map(context: StageContext) -> "MapView | None":
