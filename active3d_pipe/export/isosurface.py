@@ -159,12 +159,6 @@ def drop_small_components(mesh: TriangleMesh, min_area_m2: float) -> TriangleMes
         return mesh
     labels = np.empty(len(mesh.vertices), np.int64)
     kernels.component_labels(mesh.faces, labels)
-    of_face = labels[mesh.faces[:, 0]]
-    area = np.bincount(of_face, weights=np.linalg.norm(face_normals(mesh), axis=1), minlength=len(labels))
-    return keep_faces(mesh, (area >= min_area_m2)[of_face])
-
-
-def face_normals(mesh: TriangleMesh) -> np.ndarray:
-    """(F, 3) float64 normals whose length is the area, m2."""
-    a, b, c = (mesh.vertices[mesh.faces[:, i]].astype(np.float64) for i in range(3))
-    return 0.5 * np.cross(b - a, c - a)
+    area = np.zeros(len(labels))
+    kernels.component_areas(mesh.vertices, mesh.faces, labels, area)
+    return keep_faces(mesh, (area >= min_area_m2)[labels[mesh.faces[:, 0]]])

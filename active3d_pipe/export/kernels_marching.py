@@ -194,3 +194,16 @@ def component_labels(faces, labels):
                 labels[a] = b
     for v in range(labels.shape[0]):
         labels[v] = labels[labels[v]]
+
+
+@njit(cache=True)
+def component_areas(vertices, faces, labels, areas):
+    """Add the area of every face (F, 3), m2, to `areas` float64 at the label of its first vertex."""
+    a, b = np.empty(3), np.empty(3)
+    for f in range(faces.shape[0]):
+        for d in range(3):
+            origin = np.float64(vertices[faces[f, 0], d])
+            a[d] = vertices[faces[f, 1], d] - origin
+            b[d] = vertices[faces[f, 2], d] - origin
+        x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+        areas[labels[faces[f, 0]]] += 0.5 * np.sqrt(x * x + y * y + z * z)

@@ -5,7 +5,13 @@ from scipy.spatial import cKDTree
 from active3d_pipe.errors import ConfigError, InputError
 from active3d_pipe.export.config import MeshSettings
 from active3d_pipe.export.isosurface import drop_small_components, extract_mesh, keep_faces, near_surface
-from active3d_pipe.export.kernels_marching import EDGES, TRIANGLE_COUNT, TRIANGLE_EDGES
+from active3d_pipe.export.kernels_marching import (
+    EDGES,
+    TRIANGLE_COUNT,
+    TRIANGLE_EDGES,
+    component_areas,
+    component_labels,
+)
 from active3d_pipe.export.view_fusion import colour_mesh, cull_unseen
 from active3d_pipe.structures import TriangleMesh, VoxelGrid
 
@@ -139,3 +145,19 @@ def test_bad_input():
     grid = VoxelGrid.from_bounds(LOW, HIGH, 0.1)
     with pytest.raises(InputError, match="together"):
         extract_mesh(ball_sdf, LOW, HIGH, SETTINGS, grid=grid)
+
+
+def test_areas_of_pieces_are_those_of_their_faces():
+    def two(points):
+        balls = [np.linalg.norm(points - [x, 0, 0], axis=1) - r for x, r in ((-0.2, 0.15), (0.3, 0.1))]
+        return np.minimum(*balls).astype(np.float32)
+
+    mesh = extract_mesh(two, LOW, HIGH, SETTINGS.model_copy(update={"min_component_m2": 0.0}))
+    labels, areas = np.empty(len(mesh.vertices), np.int64), np.zeros(len(mesh.vertices))
+    component_labels(mesh.faces, labels)
+    component_areas(mesh.vertices, mesh.faces, labels, areas)
+    a, b, c = (mesh.vertices[mesh.faces[:, i]].astype(np.float64) for i in range(3))
+    slow = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    left = a[:, 0] < 0.1
+    assert np.count_nonzero(areas) == 2
+    assert sorted(areas[areas > 0]) == pytest.approx(sorted([slow[left].sum(), slow[~left].sum()]), rel=1e-9)
