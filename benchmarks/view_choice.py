@@ -12,10 +12,9 @@ import json
 from pathlib import Path
 
 import numpy as np
+from mapping import quality
 from run_folder import FinishedRun
 
-from active3d_pipe.evaluation.image_metrics import psnr, ssim
-from active3d_pipe.mapping import branches
 from active3d_pipe.mapping.hybrid_map import HybridMap
 from active3d_pipe.mapping.refine import refine
 from active3d_pipe.mapping.update import update_map
@@ -57,16 +56,6 @@ def trained(run: FinishedRun, frames: list[Frame], iterations: int) -> HybridMap
     return hybrid
 
 
-def score(hybrid: HybridMap, views: list[Frame]) -> tuple[float, float]:
-    """Mean PSNR (dB) and SSIM."""
-    found = []
-    for frame in views:
-        shown = np.clip(hybrid.render(frame.camera, frame.T_world_camera).rgb, 0, 1)
-        truth = branches.unit_rgb(frame)
-        found.append((psnr(shown, truth), ssim(shown, truth)))
-    return tuple(np.mean(found, axis=0))
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", type=Path)
@@ -80,9 +69,9 @@ def main() -> None:
         planned, held_out = planned_views(run), run.held_out()
         for name, frames in (("planner", planned), ("random", random_views(run, len(planned), given.seed))):
             hybrid = trained(run, frames, given.iterations)
-            held, similarity = score(hybrid, held_out)
+            held, similarity = quality(hybrid, held_out)
             cells = (run.simulator.scene.name, str(len(frames)), name, f"{held:.2f}", f"{similarity:.3f}",
-                     f"{score(hybrid, frames)[0]:.2f}", str(len(hybrid.gaussians)))
+                     f"{quality(hybrid, frames)[0]:.2f}", str(len(hybrid.gaussians)))
             print("| " + " | ".join(cells) + " |", flush=True)
 
 

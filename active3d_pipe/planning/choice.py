@@ -9,7 +9,7 @@ from active3d_pipe.information.gain import GainTerms
 from active3d_pipe.planning.candidates import Directions, coarse_positions, fine_positions, view_directions
 from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.free_space import FreeSpace
-from active3d_pipe.planning.kernels_candidates import spread
+from active3d_pipe.planning.kernels_candidates import spread_values
 from active3d_pipe.planning.reward import RewardField, exact_terms, sphere_rewards
 from active3d_pipe.planning.targets import target_positions
 from active3d_pipe.structures.camera import Camera
@@ -183,7 +183,7 @@ def reward_density(pool: Pool, space: FreeSpace) -> np.ndarray:
     reach = np.arange(round(2 * sigma) + 1)
     half = np.exp(-0.5 * (reach / sigma) ** 2)
     kernel = np.concatenate([half[:0:-1], half]).astype(np.float32)
-    total, weight = spread(pool.positions, pool.best_rewards, kernel / kernel.sum(), space.grid.shape)
+    total, weight = spread_values(pool.positions, pool.best_rewards, kernel / kernel.sum(), space.grid.shape)
     out = np.where(weight > 1e-6, total / np.maximum(weight, 1e-6), 0)
     return (out / max(float(out.max()), 1e-9)).astype(np.float32)
 

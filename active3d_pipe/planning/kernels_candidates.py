@@ -47,7 +47,7 @@ def best_of_blocks(allowed, clearance, block):
 
 
 @njit(cache=True)
-def spread(positions, values, kernel, shape):
+def spread_values(positions, values, kernel, shape):
     """Sums of `values` (P,) and of 1 at voxels `positions` (P, 3), each spread with the separable `kernel` (2 r + 1,).
 
     Returns two float32 [X, Y, Z]. Positions are few and the kernel is short: a tenth of the cost of filtering.

@@ -60,10 +60,12 @@ def write_tensors(path: Path, tensors: dict[str, np.ndarray], document: Any = No
     from safetensors.numpy import save_file
 
     contiguous = {name: np.asarray(a, order="C") for name, a in sorted(tensors.items())}
+    with writing(path):
+        path.touch()  # no permission, no folder: an OSError of its own kind; what save_file says is text
     try:
         # Straight from the arrays to the file: `save` first copies everything twice, five times as slow.
         save_file(contiguous, path, metadata={"active3d": json.dumps(document, sort_keys=True)})
-    except SafetensorError as error:  # an OSError, told as text
+    except SafetensorError as error:
         raise DiskError(f"{path}: writing failed ({error}); free some space and resume") from error
 
 

@@ -7,7 +7,7 @@ from active3d_pipe.geometry import se3
 from active3d_pipe.planning.candidates import coarse_positions, fine_positions, view_directions
 from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.free_space import build_free_space, clearance, mark_body
-from active3d_pipe.planning.kernels_candidates import best_of_blocks, spread
+from active3d_pipe.planning.kernels_candidates import best_of_blocks, spread_values
 from active3d_pipe.planning.risk_field import joint_occupancy
 from active3d_pipe.structures import Camera, VoxelGrid
 from active3d_pipe.structures.motion import MotionSettings
@@ -141,7 +141,7 @@ def test_spread_is_a_truncated_filter_over_sparse_values():
     positions = np.array([[0, 0, 0], [6, 4, 3], [11, 8, 7], [6, 5, 3]])
     values = np.array([2.0, 1.0, 5.0, 0.5], np.float32)
     kernel = np.array([0.1, 0.2, 0.4, 0.2, 0.1], np.float32)
-    total, weight = spread(positions, values, kernel, shape)
+    total, weight = spread_values(positions, values, kernel, shape)
     for found, source in ((total, values), (weight, np.ones(4, np.float32))):
         dense = np.zeros(shape, np.float64)
         dense[tuple(positions.T)] = source
