@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from active3d_pipe.errors import ArtifactError
-from active3d_pipe.storage.files import reading, writing
+from active3d_pipe.storage.files import reading, write_bytes
 from active3d_pipe.structures import TriangleMesh
 
 if TYPE_CHECKING:
@@ -18,8 +18,7 @@ Y_UP_FROM_Z_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 
 
 def write_mesh_ply(path: Path, mesh: TriangleMesh) -> None:
     """Binary PLY with vertex colours, world frame (Z up, m)."""
-    with writing(path):
-        path.write_bytes(cast("bytes", _to_trimesh(mesh).export(file_type="ply")))
+    write_bytes(path, cast("bytes", _to_trimesh(mesh).export(file_type="ply")))
 
 
 def write_mesh_glb(path: Path, mesh: TriangleMesh) -> None:
@@ -28,8 +27,7 @@ def write_mesh_glb(path: Path, mesh: TriangleMesh) -> None:
 
     scene = trimesh.Scene()
     scene.add_geometry(_to_trimesh(mesh), node_name="mesh", geom_name="mesh", transform=Y_UP_FROM_Z_UP)
-    with writing(path):
-        path.write_bytes(cast("bytes", scene.export(file_type="glb")))
+    write_bytes(path, cast("bytes", scene.export(file_type="glb")))
 
 
 def read_mesh(path: Path) -> TriangleMesh:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from active3d_pipe.errors import ArtifactError
-from active3d_pipe.storage.files import reading, writing
+from active3d_pipe.storage.files import reading, write_bytes
 from active3d_pipe.structures import GaussianModel
 
 SH_C0 = 0.28209479177387814  # value of the constant spherical harmonic
@@ -33,9 +33,7 @@ def write_splats(path: Path, model: GaussianModel, comment: str = "") -> None:
     if comment:
         header.append(f"comment {comment}")
     header += [f"element vertex {n}", *(f"property float {f}" for f in FIELDS), "end_header"]
-    with writing(path), path.open("wb") as stream:
-        stream.write(("\n".join(header) + "\n").encode("ascii"))
-        stream.write(table.tobytes())
+    write_bytes(path, ("\n".join(header) + "\n").encode("ascii"), table.tobytes())
 
 
 def read_splats(path: Path) -> GaussianModel:

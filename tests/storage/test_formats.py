@@ -1,6 +1,7 @@
 """Every format: what is written is what is read, equal input gives equal bytes, damage is one clear error."""
 
 import hashlib
+import json
 from pathlib import Path
 
 import numpy as np
@@ -169,3 +170,26 @@ def test_tensors_round_trip_same_bytes_and_damage(tmp_path: Path) -> None:
     (tmp_path / "t1").write_bytes(b"\xff" * 40)
     with pytest.raises(ArtifactError, match="t1"):
         files.read_tensors(tmp_path / "t1")
+
+
+def test_tensors_are_the_file_that_the_library_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from safetensors.numpy import save
+
+    rng = np.random.default_rng(0)
+    types = ("bool", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f2", "f4", "f8")
+    tensors = {f"{i % 3}_{t}": (50 * rng.random((i % 4, 3, 5))).astype(t) for i, t in enumerate(types)}
+    tensors["turned"] = np.arange(12, dtype=np.float32).reshape(3, 4).T
+    monkeypatch.setattr(files, "PIECE", 7)
+    files.write_tensors(tmp_path / "t", tensors, {"a": "b\u00e4"})
+    contiguous = {name: np.ascontiguousarray(a) for name, a in tensors.items()}
+    assert (tmp_path / "t").read_bytes() == save(contiguous, {"active3d": json.dumps({"a": "b\u00e4"})})
+    assert {n: (a.dtype, a.shape) for n, a in files.read_tensors(tmp_path / "t")[0].items()} == {
+        n: (a.dtype, a.shape) for n, a in tensors.items()
+    }
+
+
+def test_tensors_into_a_missing_folder_keep_their_error(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        files.write_tensors(tmp_path / "missing" / "t", {"a": np.zeros(2)})
+    with pytest.raises(IsADirectoryError):
+        files.write_tensors(tmp_path, {"a": np.zeros(2)})
