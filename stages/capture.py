@@ -62,13 +62,14 @@ def _run(context: StageContext) -> None:
         path, first_step = decision.path, previous["steps_total"]
         current = np.array(previous["poses"][-1])
     path = path[: context.parameters["limit"]]
-    walk = execute_path(
-        simulator, current, path, config.motion, first_step=first_step, step_ns=capture_log.STEP_NS,
-        progress=context.progress,
-    )
-    if not walk.frames:  # a blocked first step: the camera still looks from where it stands
-        walk.frames.append(simulator.render(current, step=first_step, stamp_ns=first_step * capture_log.STEP_NS))
-    shared.save_frames(context.out, walk.frames, path)
+    with shared.log_frames(context.out, path) as log:
+        walk = execute_path(
+            simulator, current, path, config.motion, first_step=first_step, step_ns=capture_log.STEP_NS,
+            log=log, progress=context.progress,
+        )
+        if not walk.frames:  # a blocked first step: the camera still looks from where it stands
+            walk.frames.append(simulator.render(current, step=first_step, stamp_ns=first_step * capture_log.STEP_NS))
+            log(walk.frames[0])
     document = {
         "schema": "active3d.capture/1", "round": context.round, "first_step": first_step, "steps": len(walk.frames),
         "steps_total": first_step + len(walk.frames), "planned": len(path), "collisions": walk.collisions,

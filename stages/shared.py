@@ -1,8 +1,11 @@
 """What several stages need: cached frames, cached simulator, the map on disk."""
 
 import json
+import queue
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -55,12 +58,30 @@ def load_frames(folder: Path) -> "list[Frame]":
     return frames
 
 
-def save_frames(folder: Path, frames: "Sequence[Frame]", planned_path: np.ndarray) -> None:
-    """Write the log of a capture artifact, and keep the frames in memory as they will be read."""
+@contextmanager
+def log_frames(folder: Path, planned_path: np.ndarray) -> "Iterator[Callable[[Frame], None]]":
+    """Write the log of a capture artifact: gives the function that takes its frames, one after the other.
+
+    They are compressed on a thread of its own while the next ones are captured; at the end they are kept in memory as
+    they will be read. What goes wrong with the file is raised at the end.
+    """
     from active3d_pipe.storage import capture_log
 
-    capture_log.write_frames(folder / LOG_NAME, frames, planned_path)
-    _keep_frames(_identity([folder / LOG_NAME]), [capture_log.as_logged(f) for f in frames])
+    taken: list[Frame] = []
+    waiting: queue.SimpleQueue[Frame | None] = queue.SimpleQueue()
+
+    def take(frame: "Frame") -> None:
+        taken.append(frame)
+        waiting.put(frame)
+
+    with ThreadPoolExecutor(1) as pool:
+        written = pool.submit(capture_log.write_frames, folder / LOG_NAME, iter(waiting.get, None), planned_path)
+        try:
+            yield take
+        finally:
+            waiting.put(None)
+    written.result()
+    _keep_frames(_identity([folder / LOG_NAME]), [capture_log.as_logged(f) for f in taken])
 
 
 def _keep_frames(key: tuple, frames: "list[Frame]") -> None:

@@ -125,6 +125,34 @@ def project(values, R, t, view, tile_size, tile_grid, chunks, dilation, compensa
 
 
 @njit(parallel=True, fastmath=True, cache=True)
+def may_be_seen(values, Rs, ts, views, chunks, dilation, out):
+    """out (N,) bool: whether one of the views may show the primitive, by the first and widest bound of `project`.
+
+    `Rs` (V, 3, 3), `ts` (V, 3), `views` (V, 9) as in `project`, of V views.
+    """
+    n = values.shape[0]
+    margin = REACH * math.sqrt(dilation)
+    for c in prange(chunks):
+        for i in range(n * c // chunks, n * (c + 1) // chunks):
+            mx, my, mz = values[i, 0], values[i, 1], values[i, 2]
+            widest = REACH * math.exp(max(values[i, 3], max(values[i, 4], values[i, 5])))
+            seen = False
+            for v in range(len(views)):
+                R, t = Rs[v], ts[v]
+                z = R[2, 0] * mx + R[2, 1] * my + R[2, 2] * mz + t[2]
+                if not z > views[v, 8]:
+                    continue
+                fx, fy, lim_x, lim_y = views[v, 0], views[v, 1], views[v, 4], views[v, 5]
+                bound = max(fx, fy) * math.sqrt(ONE + lim_x * lim_x + lim_y * lim_y) * widest / z + margin
+                x = fx * (R[0, 0] * mx + R[0, 1] * my + R[0, 2] * mz + t[0]) / z + views[v, 2]
+                y = fy * (R[1, 0] * mx + R[1, 1] * my + R[1, 2] * mz + t[1]) / z + views[v, 3]
+                if x + bound > ZERO and x - bound < views[v, 6] and y + bound > ZERO and y - bound < views[v, 7]:
+                    seen = True
+                    break
+            out[i] = seen
+
+
+@njit(parallel=True, fastmath=True, cache=True)
 def chain_rule(values, R, t, view, chunks, dilation, compensate, rec, ids, counts, first_entry, entry_grad, grad):
     """Sum the entry gradients of every record and carry them to the parameters; rows of the unseen become 0.
 

@@ -13,6 +13,7 @@ from active3d_pipe.structures import GaussianModel
 MEANS, LOG_SCALES, QUATS = slice(0, 3), slice(3, 6), slice(6, 10)
 OPACITY_LOGITS, COLORS = 10, slice(11, 14)
 WIDTH = 14
+GROWTH = 0.05  # share of room that is taken for more when arrays grow
 
 
 class GaussianParameters:
@@ -33,20 +34,23 @@ class GaussianParameters:
         self.moment2 = moment2
         self.steps = steps
         self.workspace = Workspace()
+        self._room: tuple[Tensor, ...] = ()
 
     @classmethod
     def from_model(cls, model: GaussianModel) -> "GaussianParameters":
         """Parameters that hold a copy of `model`; moments and steps start at zero."""
-        values = torch.from_numpy(_pack(model))
-        zeros = torch.zeros_like(values)
-        return cls(values, zeros, zeros.clone(), torch.zeros(len(values), dtype=torch.int32))
+        return cls._fresh(_pack(model))
 
     @classmethod
     def from_values(cls, values: np.ndarray) -> "GaussianParameters":
         """Parameters with a copy of `values` (N, 14) float32; moments and steps start at zero."""
-        zeros = np.zeros(values.shape, np.float32)
-        steps = np.zeros(len(values), np.int32)
-        return cls.from_state({"values": values, "moment1": zeros, "moment2": zeros, "steps": steps})
+        if values.ndim != 2 or values.shape[1] != WIDTH or values.dtype != np.float32:
+            raise ArtifactError(f"Gaussians: values are {values.shape} {values.dtype}, expected (N, {WIDTH}) float32")
+        return cls._fresh(values.copy())
+
+    @classmethod
+    def _fresh(cls, values: np.ndarray) -> "GaussianParameters":
+        return cls(torch.from_numpy(values), *_no_moments(len(values)))
 
     def to_model(self) -> GaussianModel:
         """A copy as plain arrays."""
@@ -86,12 +90,23 @@ class GaussianParameters:
         """Add the primitives of `model` at the end; their moments and step counts start at zero."""
         if len(model) == 0:
             return
-        new = torch.from_numpy(_pack(model))
-        zeros = torch.zeros_like(new)
-        self.values = torch.cat([self.values.detach(), new])
-        self.moment1 = torch.cat([self.moment1, zeros])
-        self.moment2 = torch.cat([self.moment2, zeros])
-        self.steps = torch.cat([self.steps, torch.zeros(len(new), dtype=torch.int32)])
+        n = len(self)
+        room = self._reserve(n + len(model))
+        room[0][n : n + len(model)] = torch.from_numpy(_pack(model))
+        self.values, self.moment1, self.moment2, self.steps = (a[: n + len(model)] for a in room)
+
+    def _reserve(self, count: int) -> tuple[Tensor, ...]:
+        """Arrays for at least `count` primitives that begin with these; what lies beyond them was never written."""
+        room = self._room
+        if room and len(room[0]) >= count and room[0].data_ptr() == self.values.data_ptr():
+            return room
+        size = count + int(GROWTH * count)
+        room = (torch.from_numpy(np.zeros((size, WIDTH), np.float32)), *_no_moments(size))
+        held = (self.values.detach(), self.moment1, self.moment2, self.steps)
+        for new, old in zip(room, held, strict=True):
+            new[: len(self)] = old
+        self._room = room
+        return room
 
     def keep(self, mask: np.ndarray) -> None:
         """Drop the primitives where `mask` (N,) bool is False; the others keep order and optimiser state."""
@@ -101,26 +116,21 @@ class GaussianParameters:
         self.values = self.values.detach()[kept]
         self.moment1, self.moment2, self.steps = self.moment1[kept], self.moment2[kept], self.steps[kept]
 
-    def split(self, mask: np.ndarray) -> "GaussianParameters":
-        """Keep the primitives where `mask` (N,) bool is True and return the others; `join` puts both together."""
-        out = torch.from_numpy(np.flatnonzero(~mask))
-        others = GaussianParameters(
-            self.values.detach()[out], self.moment1[out], self.moment2[out], self.steps[out]
-        )
-        self.keep(mask)
-        return others
+    def rest(self, mask: np.ndarray) -> np.ndarray:
+        """Keep the primitives where `mask` (N,) bool is False; returns the values (M, 14) of the others for `wake`."""
+        resting = self.values.detach().numpy()[mask]
+        self.keep(~mask)
+        return resting
 
-    def join(self, others: "GaussianParameters") -> None:
-        """Put `others` in front of these primitives, optimiser state included."""
-        self.values = torch.cat([others.values, self.values.detach()])
-        self.moment1 = torch.cat([others.moment1, self.moment1])
-        self.moment2 = torch.cat([others.moment2, self.moment2])
-        self.steps = torch.cat([others.steps, self.steps])
-
-    def forget(self) -> None:
-        """Set moments and step counts to zero, as if the optimiser had never run."""
-        self.moment1, self.moment2 = torch.zeros_like(self.values), torch.zeros_like(self.values)
-        self.steps = torch.zeros(len(self), dtype=torch.int32)
+    def wake(self, resting: np.ndarray) -> None:
+        """Put primitives with these values (M, 14) in front, as if the optimiser had never run on them."""
+        held = (self.values.detach(), self.moment1, self.moment2, self.steps)
+        m = len(resting)
+        whole = (np.empty((m + len(self), WIDTH), np.float32), *(a.numpy() for a in _no_moments(m + len(self))))
+        whole[0][:m] = resting
+        for new, old in zip(whole, held, strict=True):
+            new[m:] = old
+        self.values, self.moment1, self.moment2, self.steps = (torch.from_numpy(a) for a in whole)
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything a later `from_state` needs to go on with the same bytes; views, valid until the next step.
@@ -180,6 +190,13 @@ class GaussianParameters:
             np.float32(settings.adam_beta1), np.float32(settings.adam_beta2),
             selective, visible if selective else np.zeros(0, bool),  # type: ignore[arg-type]
         )
+
+
+def _no_moments(n: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Moments and step counts of n primitives that were never moved; NumPy's zeros take memory when written to."""
+    shapes = ((n, WIDTH), np.float32), ((n, WIDTH), np.float32), ((n,), np.int32)
+    moment1, moment2, steps = (torch.from_numpy(np.zeros(shape, dtype)) for shape, dtype in shapes)
+    return moment1, moment2, steps
 
 
 def _pack(model: GaussianModel) -> np.ndarray:

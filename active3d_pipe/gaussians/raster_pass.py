@@ -1,6 +1,7 @@
 """One forward and backward pass of the rasteriser over plain arrays, with buffers that are reused."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numba
@@ -124,17 +125,6 @@ class RasterPass:
         )
         return grad
 
-    def project(self, values: np.ndarray, camera: Camera, T_world_camera: np.ndarray) -> np.ndarray:
-        """(N,) bool, the primitives of `values` (N, 14) that the view shows; nothing is drawn."""
-        n, get = len(values), self.workspace.get
-        counts, ids = get("counts", (CHUNKS,), np.int64), get("ids", (n,), np.int32)
-        R, t, view = view_arrays(camera, T_world_camera)
-        kernels_projection.project(
-            values, R, t, view, TILE_SIZE, tile_grid(camera), CHUNKS, np.float32(self.dilation_px2), self.compensate,
-            get("rec", (n, 16), np.float32), ids, get("box", (n, 4), np.int16), counts,
-        )
-        return _mask(ids, counts, n)
-
     @property
     def num_visible(self) -> int:
         """Number of primitives that the last `forward` projected onto a drawn image."""
@@ -142,17 +132,24 @@ class RasterPass:
 
     def visible(self) -> np.ndarray:
         """(N,) bool, primitives that the last `forward` projected onto a drawn image."""
-        s = self._state
-        return _mask(s["ids"], s["counts"], len(s["values"]))
+        s, n = self._state, len(self._state["values"])
+        mask = np.zeros(n, bool)
+        for c in range(CHUNKS):
+            start = n * c // CHUNKS
+            mask[s["ids"][start : start + s["counts"][c]]] = True
+        return mask
 
 
-def _mask(ids: np.ndarray, counts: np.ndarray, n: int) -> np.ndarray:
-    """(n,) bool, True for the primitives behind the records of every chunk."""
-    mask = np.zeros(n, bool)
-    for c in range(CHUNKS):
-        start = n * c // CHUNKS
-        mask[ids[start : start + counts[c]]] = True
-    return mask
+def may_be_seen(
+    values: np.ndarray, cameras: Sequence[Camera], poses: Sequence[np.ndarray], dilation_px2: float
+) -> np.ndarray:
+    """(N,) bool, a superset of the primitives of `values` (N, 14) that the views at `poses` show; a cheap test."""
+    out = np.zeros(len(values), bool)
+    if not len(poses):
+        return out
+    Rs, ts, views = (np.stack(a) for a in zip(*map(view_arrays, cameras, poses), strict=True))
+    kernels_projection.may_be_seen(values, Rs, ts, views, CHUNKS, np.float32(dilation_px2), out)
+    return out
 
 
 def tile_grid(camera: Camera) -> tuple[int, int]:

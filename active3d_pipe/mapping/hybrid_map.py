@@ -14,7 +14,7 @@ from active3d_pipe.field.sdf_field import SdfField
 from active3d_pipe.field.surface_view import SurfaceView
 from active3d_pipe.field.tsdf import TsdfField
 from active3d_pipe.gaussians.parameters import GaussianParameters
-from active3d_pipe.gaussians.raster_pass import RasterPass
+from active3d_pipe.gaussians.raster_pass import may_be_seen
 from active3d_pipe.gaussians.rasteriser import RenderedView, render_view
 from active3d_pipe.mapping.config import MappingSettings
 from active3d_pipe.mapping.keyframes import Keyframe
@@ -41,7 +41,7 @@ class HybridMap:
         self.settings = settings
         self.keyframes = list(keyframes)
         self.submap = (0, 0)
-        self._resting: GaussianParameters | None = None
+        self._resting: np.ndarray | None = None
         self._surface_view: SurfaceView | None = None
 
     @property
@@ -51,19 +51,15 @@ class HybridMap:
 
     @contextmanager
     def working_set(self, frames: Sequence[Frame]) -> Iterator[None]:
-        """Inside, `gaussians` holds only what `frames` see, so that an iteration costs what is near, not the scene.
+        """Inside, `gaussians` holds only what `frames` may see, so that an iteration costs what is near, not the scene.
 
         Views of other frames are incomplete meanwhile. Primitives that rest stay as they are, and forget their
         optimiser state: what a checkpoint holds of it is what the last working set needs.
         """
-        settings, values = self.settings.gaussians, self.gaussians.values.numpy()
-        raster = RasterPass(
-            dilation_px2=settings.dilation_px2, compensate=settings.opacity_compensation,
-            workspace=self.gaussians.workspace,
+        seen = may_be_seen(
+            self.gaussians.values.numpy(), [f.camera for f in frames], [f.T_world_camera for f in frames],
+            self.settings.gaussians.dilation_px2,
         )
-        seen = np.zeros(len(values), bool)
-        for frame in frames:
-            seen |= raster.project(values, frame.camera, frame.T_world_camera)
         with self._only(seen):
             yield
 
@@ -75,12 +71,11 @@ class HybridMap:
 
     @contextmanager
     def _only(self, mask: np.ndarray) -> Iterator[None]:
-        self._resting = self.gaussians.split(mask)
-        self._resting.forget()
+        self._resting = self.gaussians.rest(~mask)
         try:
             yield
         finally:
-            self.gaussians.join(self._resting)
+            self.gaussians.wake(self._resting)
             self._resting = None
 
     @classmethod

@@ -13,7 +13,7 @@ from active3d_pipe.errors import InputError
 from active3d_pipe.planning.candidates import Directions, view_directions
 from active3d_pipe.planning.choice import Pool, looks_along, reward_density, score, utility_rate, view_cost_steps
 from active3d_pipe.planning.config import PlanningSettings
-from active3d_pipe.planning.free_space import FreeSpace, build_free_space
+from active3d_pipe.planning.free_space import FreeSpace, begin_free_space, build_free_space
 from active3d_pipe.planning.outcome import account_terms, expected_along
 from active3d_pipe.planning.path import look_around, step_path
 from active3d_pipe.planning.reward import RewardField, build_reward_field, exact_terms
@@ -83,24 +83,26 @@ def decide(
             f"{grid.high.round(2).tolist()}; enlarge the bounds"
         )
     walked = np.concatenate([np.asarray(walked_poses, dtype=np.float64).reshape(-1, 4, 4), T[None]])
+    space = begin_free_space(volume, T, walked[:, :3, 3], motion, settings)
     field = build_reward_field(volume, walked, camera, settings)
     directions = view_directions(camera, settings.num_yaws, settings.pitches_deg)
     task = _Task(volume.round, T, camera, directions, motion, settings, rng)
-    decision = _choose(task, volume, walked, field, previous)
+    decision = _choose(task, volume, walked, space(), field, previous)
     promised = expected_along(field, decision.path, camera)
     return replace(decision, terms={**decision.terms, **account_terms(volume, promised, previous)})
 
 
 def _choose(
-    task: _Task, volume: UncertaintyVolume, walked: np.ndarray, field: RewardField, previous: Decision | None
+    task: _Task, volume: UncertaintyVolume, walked: np.ndarray, space: FreeSpace, field: RewardField,
+    previous: Decision | None,
 ) -> Decision:
     """The decision itself, without the account of predicted and realised gain."""
     T, camera, motion, settings = task.T, task.camera, task.motion, task.settings
     best = 0.0
     # The quick search overlooks what few views can see; only a thorough one may say that nothing is left.
     for relaxed, thorough in ((False, False), (False, True), (True, False)):
-        if not thorough:
-            space = build_free_space(volume, T, walked[:, :3, 3], motion, settings, relaxed=relaxed)
+        if relaxed:
+            space = build_free_space(volume, T, walked[:, :3, 3], motion, settings, relaxed=True)
         how = _thorough(settings) if thorough else settings
         pool = score(space, field, T, camera, motion, how, previous)
         best = max((t.reward for t in pool.terms), default=0.0)

@@ -1,5 +1,7 @@
 """Where the agent may go: known-free space, clearance, and what of it can be reached."""
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -144,7 +146,7 @@ def _open_escape(
     return checked
 
 
-def build_free_space(
+def begin_free_space(
     volume: UncertaintyVolume,
     T_world_camera: np.ndarray,
     walked: np.ndarray,
@@ -152,12 +154,17 @@ def build_free_space(
     settings: PlanningSettings,
     *,
     relaxed: bool = False,
-) -> FreeSpace:
-    """Known-free space, risk field and geodesic distances from the current pose.
+) -> Callable[[], FreeSpace]:
+    """Known-free space, risk field and geodesic distances from the pose, those on a thread of their own.
+
+    The distances are one long serial computation, a third of a decision: the caller has other work to do meanwhile.
 
     Args:
         walked: (N, 3) world positions of the poses walked so far, the current one included.
         relaxed: demand only the agent's radius as clearance, without the margin.
+
+    Returns:
+        a function that waits for the distances and returns the whole; to be called once.
     """
     grid = volume.grid
     occupancy = joint_occupancy(volume.arrays, settings)
@@ -175,5 +182,17 @@ def build_free_space(
         checked = _open_escape(passable, clear, solid, grid, position, (required, escape), settings)
     passable[tuple(start)] = True
     planar = motion.model == "ground"
-    cost, parent = _geodesic(risk, passable, start, planar, settings, UNREACHABLE)
-    return FreeSpace(risk, free, checked, passable, start, required, escape, cost, parent, planar)
+    pool = ThreadPoolExecutor(1)
+    found = pool.submit(_geodesic, risk, passable, start, planar, settings, UNREACHABLE)
+    pool.shutdown(wait=False)
+    return lambda: FreeSpace(
+        risk, free, checked, passable, start, required, escape, *found.result(), planar
+    )
+
+
+def build_free_space(
+    volume: UncertaintyVolume, T_world_camera: np.ndarray, walked: np.ndarray, motion: MotionSettings,
+    settings: PlanningSettings, *, relaxed: bool = False,
+) -> FreeSpace:
+    """`begin_free_space`, waited for."""
+    return begin_free_space(volume, T_world_camera, walked, motion, settings, relaxed=relaxed)()

@@ -103,7 +103,7 @@ def _pop(keys, ids, n):
     return n
 
 
-@njit(cache=True)
+@njit(nogil=True, cache=True)
 def geodesic(passable, rate, start, voxel_size, planar, limit):
     """Dijkstra over the 26 neighbours (8 when `planar`) from the voxel `start` (3,).
 

@@ -41,9 +41,9 @@ def check_step(before: np.ndarray, after: np.ndarray, motion: MotionSettings, wh
 
 def execute_path(
     simulator: Simulator, current: np.ndarray, path: np.ndarray, motion: MotionSettings, *, first_step: int,
-    step_ns: int, progress: Callable[[str], None],
+    step_ns: int, log: Callable[[Frame], None], progress: Callable[[str], None],
 ) -> Walk:
-    """Execute `path` (M, 4, 4) from pose `current`, capturing a frame after every step.
+    """Execute `path` (M, 4, 4) from pose `current`, capturing a frame after every step and handing it to `log`.
 
     A step whose segment comes nearer to the true mesh than the agent's radius is a collision: it is not
     taken, it is counted, and the leg ends there.
@@ -63,6 +63,7 @@ def execute_path(
         clock = time.perf_counter()
         walk.frames.append(simulator.render(T, step=step, stamp_ns=step * step_ns))
         walk.seconds["render"] += time.perf_counter() - clock
+        log(walk.frames[-1])
         walk.length_m += length
         current = T
         progress(f"step {step}")

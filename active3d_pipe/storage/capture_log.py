@@ -4,7 +4,7 @@ Foxglove protobuf schemas, so that Rerun, Foxglove, and any MCAP reader with the
 Times are simulated, never wall clock: equal runs give equal bytes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -25,8 +25,8 @@ WORLD, OPTICAL = "world", "camera_optical"
 STEP_NS = 100_000_000  # simulated duration of a step
 
 
-def write_frames(path: Path, frames: Sequence[Frame], planned_path: np.ndarray) -> None:
-    """Write frames and the planned path (M, 4, 4) T_world_camera to a closed MCAP file."""
+def write_frames(path: Path, frames: Iterable[Frame], planned_path: np.ndarray) -> None:
+    """Write frames, as they come, and the planned path (M, 4, 4) T_world_camera to a closed MCAP file."""
     from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
     from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
     from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
@@ -40,8 +40,8 @@ def write_frames(path: Path, frames: Sequence[Frame], planned_path: np.ndarray) 
         COLOR: CompressedImage, DEPTH: RawImage, CALIBRATION: CameraCalibration, DEPTH_CALIBRATION: CameraCalibration,
         TRANSFORMS: FrameTransforms, POSE: PoseInFrame, PATH: PosesInFrame,
     }
-    with writing(path), path.open("wb") as stream, ThreadPoolExecutor(COMPRESSION_THREADS) as pool:
-        images = pool.map(encode_png, [frame.rgb for frame in frames])  # in order, ahead of the chunks' compression
+    camera = Camera(1, 1, 1, 1, 0.5, 0.5)
+    with writing(path), path.open("wb") as stream:
         writer = Writer(stream, compression=CompressionType.ZSTD, enable_crcs=True)
         # Set by ourselves: the default names the library's version, and an upgrade would change the bytes.
         writer.start(profile="", library=f"active3d/{__version__}")
@@ -52,16 +52,17 @@ def write_frames(path: Path, frames: Sequence[Frame], planned_path: np.ndarray) 
             data = message.SerializeToString(deterministic=True)
             writer.add_message(channels[topic], frame.stamp_ns, data, frame.stamp_ns, sequence=frame.step)
 
-        for i, (frame, image) in enumerate(zip(frames, images, strict=True)):
+        for i, frame in enumerate(frames):
             if i == 0:
+                camera = frame.camera
                 add(PATH, _path_message(PosesInFrame(), frame, planned_path), frame)
-            add(COLOR, _color_message(CompressedImage(), frame, image), frame)
+            add(COLOR, _color_message(CompressedImage(), frame, encode_png(frame.rgb)), frame)
             add(DEPTH, _depth_message(RawImage(), frame), frame)
             add(CALIBRATION, _calibration_message(CameraCalibration(), frame), frame)
             add(DEPTH_CALIBRATION, _calibration_message(CameraCalibration(), frame), frame)
             add(TRANSFORMS, _transform_message(FrameTransforms(), frame), frame)
             add(POSE, _pose_message(PoseInFrame(), frame), frame)
-        writer.add_metadata("active3d", {"schema": "active3d.capture/1", "camera": _range_text(frames)})
+        writer.add_metadata("active3d", {"schema": "active3d.capture/1", "camera": f"{camera.near!r} {camera.far!r}"})
         writer.finish()
 
 
@@ -120,11 +121,6 @@ def _matrix(position: np.ndarray, quat: np.ndarray) -> np.ndarray:
     T[:3, :3] = se3.matrix_from_quat(quat)
     T[:3, 3] = position
     return T
-
-
-def _range_text(frames: Sequence[Frame]) -> str:
-    camera = frames[0].camera if frames else Camera(1, 1, 1, 1, 0.5, 0.5)
-    return f"{camera.near!r} {camera.far!r}"
 
 
 def _stamp(message: Any, frame: Frame, frame_id: str) -> None:

@@ -111,15 +111,37 @@ def test_resume_gives_the_same_bytes() -> None:
 def test_state_holds_moments_of_what_moved_only() -> None:
     moved = GaussianParameters.from_model(wall(20))
     moved.step(np.ones((20, 14), np.float32), GaussianSettings())
-    resting = moved.split(np.arange(20) >= 8)
-    resting.forget()
-    moved.join(resting)
+    resting = moved.rest(np.arange(20) < 8)
+    assert len(moved) == 12 and resting.shape == (8, 14)
+    moved.wake(resting)
     moved.append(wall(3, 2))
     state = moved.state()
     assert [len(state[n]) for n in ("values", "moment1", "moment2", "steps")] == [23, 15, 15, 15]
     back = GaussianParameters.from_state(state)
     for name in ("values", "moment1", "moment2", "steps"):
         assert torch.equal(getattr(back, name), getattr(moved, name))
+
+
+def test_primitives_that_are_added_one_lot_after_the_other_start_like_those_that_were_there() -> None:
+    lots = [wall(7 + i, i) for i in range(40)]
+    grown, plain = GaussianParameters.from_model(lots[0]), GaussianParameters.from_model(lots[0])
+    rng = np.random.default_rng(0)
+    for i, lot in enumerate(lots[1:]):
+        before = plain.values.numpy().copy()
+        grown.append(lot)
+        new = GaussianParameters.from_model(lot)
+        held = [(getattr(plain, k), getattr(new, k)) for k in ("values", "moment1", "moment2", "steps")]
+        plain = GaussianParameters(*(torch.cat(pair) for pair in held))
+        assert np.array_equal(grown.values.numpy()[: len(before)], before)
+        grads = rng.normal(size=(len(grown), 14)).astype(np.float32)
+        for params in (grown, plain):
+            params.step(grads, GaussianSettings())
+        if i % 7 == 3:
+            keep = rng.random(len(grown)) < 0.8
+            grown.keep(keep)
+            plain.keep(keep)
+        for name in ("values", "moment1", "moment2", "steps"):
+            assert torch.equal(getattr(grown, name), getattr(plain, name))
 
 
 @pytest.mark.parametrize("damage", ["missing", "shape", "dtype"])

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from active3d_pipe.errors import InputError
 from active3d_pipe.gaussians.config import GaussianSettings
-from active3d_pipe.gaussians.raster_pass import RasterPass, tile_grid
+from active3d_pipe.gaussians.raster_pass import RasterPass, may_be_seen, tile_grid
 from active3d_pipe.gaussians.rasteriser import render, render_view
 from active3d_pipe.gaussians.reference import render_reference
 from active3d_pipe.geometry import se3
@@ -151,6 +151,21 @@ def test_gaussians_behind_the_camera_are_not_drawn() -> None:
     assert not out.any()
     assert not raster.backward(np.ones_like(out)).any()
     assert not raster.visible().any()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_views_show_is_among_what_they_may_show(seed: int) -> None:
+    values = random_values(3000, seed)
+    values[:, :3] *= 3
+    poses, cameras = [tilted_pose(seed), tilted_pose(seed + 9)], [Camera(83, 61, 90.0, 88.0, 40.0, 31.5)] * 2
+    shown = np.zeros(len(values), bool)
+    for camera, T in zip(cameras, poses):
+        raster = RasterPass()
+        raster.forward(values, camera, T)
+        shown |= raster.visible()
+    may = may_be_seen(values, cameras, poses, RasterPass().dilation_px2)
+    assert not (shown & ~may).any() and shown.any() and not may.all()
+    assert not may_be_seen(values, [], [], 0.1).any()
 
 
 def test_tiles_draw_their_part_and_nothing_else() -> None:
