@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from active3d_pipe.geometry.thinning import thinned
 from active3d_pipe.mapping.hybrid_map import HybridMap
 from active3d_pipe.mapping.update import update_map
 from active3d_pipe.pipeline.config import Config, load_config, load_run_config, with_values
@@ -40,7 +41,7 @@ def smaller(frame: Frame, scale: int) -> Frame:
     """The frame at 1 / scale of its resolution."""
     if scale == 1:
         return frame
-    rgb, depth, camera = shared.thinned(frame, scale)
+    rgb, depth, camera = thinned(frame, scale)
     return Frame(frame.step, frame.stamp_ns, camera, frame.T_world_camera, np.rint(rgb * 255).astype(np.uint8), depth)
 
 

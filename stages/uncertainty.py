@@ -23,12 +23,13 @@ def residuals(
     hybrid: "HybridMap", frames: "Sequence[Frame]", stride: int, timings: dict[str, float], *, of_field: bool = False
 ) -> "list[ViewResidual]":
     """Errors of the map's renderings at the frames' poses, every `stride`-th pixel; the field's beside, if asked."""
+    from active3d_pipe.geometry.thinning import thinned
     from active3d_pipe.uncertainty.explicit import view_residuals
 
     start = time.perf_counter()
     out, query = [], hybrid.field.query_sdf if of_field else None
     for frame in frames:
-        rgb, depth, camera = shared.thinned(frame, stride)
+        rgb, depth, camera = thinned(frame, stride)
         view = hybrid.render(camera, frame.T_world_camera)
         out.append(view_residuals(view.rgb, view.depth, view.alpha, rgb, depth, camera, frame.T_world_camera, query))
     timings["residuals"] = timings.get("residuals", 0.0) + time.perf_counter() - start

@@ -40,6 +40,12 @@ class MeshSettings(Settings):
     fusion_truncation_cells: float = Field(
         2.0, gt=0, description="truncation of that fusion, marching-cubes cells"
     )
+    sheet_frames: int = Field(
+        3, ge=0, description="frames with readings off the surface from which faces are laid through them; 0: never"
+    )
+    sheet_agreement: float = Field(
+        0.25, ge=0, le=1, description="least share of the frames it is not hidden from that must read surface there"
+    )
     colour: Literal["views", "field"] = Field(
         "views", description="views: from the logged frames that see a vertex; field: the field's own, softer"
     )

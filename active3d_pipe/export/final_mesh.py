@@ -1,10 +1,11 @@
-"""The mesh that a run hands over: extracted near what was read, culled by what was seen, coloured from the views."""
+"""The mesh that a run hands over: extracted near what was read, culled by what was seen, completed, coloured."""
 
 from collections.abc import Sequence
 
 from active3d_pipe.export.config import MeshSettings
 from active3d_pipe.export.correction import corrected_sdf
 from active3d_pipe.export.isosurface import drop_small_components, extract_mesh
+from active3d_pipe.export.sheets import with_sheets
 from active3d_pipe.export.view_fusion import colour_from_views, colour_mesh, cull_unseen, near_readings
 from active3d_pipe.field.surface_view import Surface
 from active3d_pipe.structures import Frame, TriangleMesh
@@ -23,6 +24,7 @@ def final_mesh(field: Surface, frames: Sequence[Frame], settings: MeshSettings) 
     query_sdf = corrected_sdf(field.query_sdf, field.low, field.high, frames, settings)
     mesh = extract_mesh(query_sdf, field.low, field.high, whole, grid=grid, observed=observed)
     mesh = drop_small_components(cull_unseen(mesh, frames, settings), settings.min_component_m2)
+    mesh = with_sheets(mesh, frames, field.low, field.high, settings)
     if settings.colour == "views":
         return colour_from_views(mesh, frames, settings, field.query_color)
     return colour_mesh(mesh, field.query_color)

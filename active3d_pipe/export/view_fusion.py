@@ -33,7 +33,7 @@ def near_readings(
     origin = grid.origin.astype(np.float32)
     for frame in frames:
         kernels.mark_readings(
-            *_pose(frame), frame.depth, READING_STRIDE, np.float32(JOIN), origin, np.float32(1 / cell_m), marks
+            *frame_arrays(frame), frame.depth, READING_STRIDE, np.float32(JOIN), origin, np.float32(1 / cell_m), marks
         )
     if dilate:
         for axis in range(3):  # a box separates into its three axes
@@ -60,7 +60,7 @@ def cull_unseen(mesh: TriangleMesh, frames: Sequence[Frame], settings: MeshSetti
     spheres = _spheres(centroids)
     for frame in frames:
         kernels.mark_seen(
-            spheres, centroids, normals, *_pose(frame), frame.depth, np.float32(frame.camera.near),
+            spheres, centroids, normals, *frame_arrays(frame), frame.depth, np.float32(frame.camera.near),
             np.float32(frame.depth.max()), np.float32(settings.cull_tolerance_m),
             np.float32(settings.cull_facing_cosine), seen,
         )
@@ -91,7 +91,7 @@ def colour_from_views(
         sums = np.zeros((len(vertices), 4), np.float32)
         for frame in spread(frames, MAX_COLOUR_FRAMES):
             kernels.add_colours(
-                spheres, vertices, normals, *_pose(frame), frame.depth, frame.rgb, np.float32(frame.camera.near),
+                spheres, vertices, normals, *frame_arrays(frame), frame.depth, frame.rgb, np.float32(frame.camera.near),
                 np.float32(frame.depth.max()), np.float32(settings.colour_tolerance_m), np.float32(MIN_COSINE),
                 np.float32(COLOUR_FOOTPRINT * settings.voxel_size_m), mean, np.float32(inv_variance), sums,
             )
@@ -117,7 +117,8 @@ def _spheres(points: np.ndarray) -> np.ndarray:
     return spheres
 
 
-def _pose(frame: Frame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def frame_arrays(frame: Frame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rotation camera -> world (3, 3), centre (3,) m, intrinsics (fx, fy, cx, cy): float32, for the kernels."""
     T, c = frame.T_world_camera.astype(np.float32), frame.camera
     intrinsics = np.array([c.fx, c.fy, c.cx, c.cy], np.float32)
     return np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3]), intrinsics

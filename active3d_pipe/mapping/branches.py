@@ -5,6 +5,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,8 +18,9 @@ from active3d_pipe.gaussians.optimisation import optimise_step
 from active3d_pipe.gaussians.pruning import prune_mask
 from active3d_pipe.gaussians.sdf_coupling import sdf_gradient
 from active3d_pipe.gaussians.seeding import error_driven, seed_frame
+from active3d_pipe.geometry.thinning import thinned
 from active3d_pipe.mapping.hybrid_map import HybridMap
-from active3d_pipe.structures import Frame
+from active3d_pipe.structures import Camera, Frame
 
 COUPLED = 8192  # primitives of one coupling step
 
@@ -42,6 +44,22 @@ def unit_rgb(frame: Frame) -> np.ndarray:
     return frame.rgb.astype(np.float32) * np.float32(1 / 255)
 
 
+class Target(NamedTuple):
+    """An image to train on: rgb (H, W, 3) float32 0..1, depth (H, W) float32 m, and where it was seen from."""
+
+    rgb: np.ndarray
+    depth: np.ndarray
+    camera: Camera
+    T_world_camera: np.ndarray
+
+
+def target(frame: Frame, stride: int = 1) -> Target:
+    """What a frame asks of the Gaussians, every pixel or the means of `stride` x `stride`."""
+    if stride == 1:
+        return Target(unit_rgb(frame), frame.depth, frame.camera, frame.T_world_camera)
+    return Target(*thinned(frame, stride), frame.T_world_camera)
+
+
 def seed(hybrid: HybridMap, frame: Frame, rng: np.random.Generator, clock: Clock) -> int:
     """Insert primitives where the frame shows surface that the map does not render; returns their number."""
     settings = hybrid.settings.gaussians
@@ -58,13 +76,13 @@ def seed(hybrid: HybridMap, frame: Frame, rng: np.random.Generator, clock: Clock
 
 
 def train_gaussians(
-    hybrid: HybridMap, frame: Frame, rate: float, clock: Clock, coupling: np.ndarray | None = None
+    hybrid: HybridMap, seen: Target, rate: float, clock: Clock, coupling: np.ndarray | None = None
 ) -> dict[str, float]:
-    """One iteration of E_photo and depth on one frame; `coupling` is the gradient of E_geo, see `coupling_gradient`."""
+    """One iteration of E_photo and depth on one image; `coupling` is the gradient of E_geo, see `coupling_gradient`."""
     with clock.of("gaussians"):
         return optimise_step(
-            hybrid.gaussians, frame.camera, frame.T_world_camera, unit_rgb(frame), frame.depth,
-            hybrid.settings.gaussians, rate, extra_gradient=coupling,
+            hybrid.gaussians, seen.camera, seen.T_world_camera, seen.rgb, seen.depth, hybrid.settings.gaussians, rate,
+            extra_gradient=coupling,
         )
 
 

@@ -62,6 +62,9 @@ class MappingSettings(Settings):
     field_iterations_per_step: float = Field(0.25, ge=0, description="field iterations for every captured frame")
     gaussian_iterations_per_keyframe: float = Field(1.5, ge=0, description="and for every keyframe")
     field_iterations_per_keyframe: float = Field(0.75, ge=0, description="and for every keyframe")
+    round_stride: int = Field(
+        2, ge=1, description="rounds train Gaussians on means of n x n pixels; the refinement on every pixel"
+    )
     first_round_factor: float = Field(1.5, gt=0, description="iterations of round 0 are multiplied by this")
     coupling_every: int = Field(10, ge=1, description="E_geo is applied on every n-th Gaussian iteration")
     add_per_round: int = Field(6000, ge=0, description="most primitives that error-driven adding inserts in a round")

@@ -50,7 +50,7 @@ def refine(
         pull = None
         if coupled and i % settings.coupling_every == settings.coupling_every - 1:
             pull = branches.coupling_gradient(hybrid, rng, clock)
-        terms = branches.train_gaussians(hybrid, frame, annealed(i, total), clock, pull)
+        terms = branches.train_gaussians(hybrid, branches.target(frame), annealed(i, total), clock, pull)
         if not np.isfinite(terms["loss"]):
             raise NumericalError(f"refinement: the loss is not finite in iteration {i}; lower the learning rates")
         scores.append(terms["psnr"])

@@ -124,6 +124,7 @@ def _gaussians(
     coupled = settings.representation == "hybrid"
     limit = int(settings.gaussians.max_count * settings.adding_share)
     scores: list[float] = []
+    targets: dict[int, branches.Target] = {}
     added = pruned = 0
     # Adding looks once at every new keyframe and at some of the others, in the first two thirds of the iterations, so
     # that what is new still settles.
@@ -138,8 +139,9 @@ def _gaussians(
         pull = None
         if coupled and i % settings.coupling_every == settings.coupling_every - 1:
             pull = branches.coupling_gradient(hybrid, rng, clock)
-        frame = hybrid.keyframes[index].frame
-        terms = branches.train_gaussians(hybrid, frame, settings.learning_rate_scale, clock, pull)
+        if index not in targets:
+            targets[index] = branches.target(hybrid.keyframes[index].frame, settings.round_stride)
+        terms = branches.train_gaussians(hybrid, targets[index], settings.learning_rate_scale, clock, pull)
         if not np.isfinite(terms["loss"]):
             raise NumericalError(f"gaussians: the loss is not finite in iteration {i}; lower the learning rates")
         scores.append(terms["psnr"])

@@ -5,6 +5,7 @@ import pytest
 from room_with_ball import HIGH, LOW, render
 
 from active3d_pipe.geometry import projection, se3
+from active3d_pipe.mapping.branches import target
 from active3d_pipe.mapping.config import MappingSettings
 from active3d_pipe.mapping.hybrid_map import HybridMap
 from active3d_pipe.mapping.keyframes import (
@@ -146,3 +147,20 @@ def test_a_round_teaches_both_branches_what_the_frames_show() -> None:
     assert np.abs(view.rgb - frame.rgb / 255.0)[shown].mean() < 0.06
     points = depth_samples(frame, 4).astype(np.float32)
     assert np.median(np.abs(hybrid.field.query_sdf(points))) < 0.05
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_rounds_learn_the_view_from_every_pixel_and_from_means_of_them(stride: int) -> None:
+    settings = SETTINGS.model_copy(update={"round_stride": stride, "gaussian_iterations_per_step": 0.0})
+    frames = frames_between(0, 3)
+    errors = []
+    for iterations in (0.0, 30.0):
+        hybrid = HybridMap.create(LOW, HIGH, settings, np.random.default_rng(0))
+        how = settings.model_copy(update={"gaussian_iterations_per_keyframe": iterations, "add_per_round": 0})
+        update_map(hybrid, frames, None, 0, how, np.random.default_rng(0), lambda _: None)
+        views = [hybrid.render(f.camera, f.T_world_camera).rgb for f in frames]
+        errors.append(np.mean([(v - f.rgb / 255) ** 2 for v, f in zip(views, frames)]))
+    assert errors[1] < 0.6 * errors[0]
+    small = target(frames[0], stride)
+    assert small.rgb.shape == (CAMERA.height // stride, CAMERA.width // stride, 3) and small.rgb.max() <= 1
+    assert small.camera.fx == pytest.approx(CAMERA.fx / stride)

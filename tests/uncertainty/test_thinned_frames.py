@@ -5,8 +5,8 @@ import pytest
 from uncertainty_room import pose
 
 from active3d_pipe.geometry import projection
+from active3d_pipe.geometry.thinning import thinned
 from active3d_pipe.structures import Camera, Frame
-from stages.shared import thinned
 
 CAMERA = Camera.from_fov(120, 68, 90, far=50)
 HEIGHT_M = 1.2

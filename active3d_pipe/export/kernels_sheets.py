@@ -1,0 +1,124 @@
+# mypy: ignore-errors
+"""Depth readings that no face explains: where they lie, what else the frames say there, and faces through them.
+
+`rotation` (3, 3) is camera -> world, `centre` (3,) m, `intrinsics` (fx, fy, cx, cy); all float32. `marks` (X, Y, Z)
+uint8 on cells of 1 / inv_size m from `low` (3,) up: OPEN, EXPLAINED (near a face) or WANTED (to be covered).
+"""
+
+import numpy as np
+from numba import njit, prange
+
+OPEN, EXPLAINED, WANTED = np.uint8(0), np.uint8(1), np.uint8(2)
+
+
+@njit(cache=True)
+def mark_faces(vertices, faces, low, inv_size, marks):
+    """Set EXPLAINED in the cells of all vertices and face centres, and in the 26 around each."""
+    nx, ny, nz = marks.shape
+    for f in range(len(vertices) + len(faces)):
+        if f < len(vertices):
+            x, y, z = vertices[f, 0], vertices[f, 1], vertices[f, 2]
+        else:
+            a, b, c = faces[f - len(vertices), 0], faces[f - len(vertices), 1], faces[f - len(vertices), 2]
+            third = np.float32(1 / 3)
+            x = (vertices[a, 0] + vertices[b, 0] + vertices[c, 0]) * third
+            y = (vertices[a, 1] + vertices[b, 1] + vertices[c, 1]) * third
+            z = (vertices[a, 2] + vertices[b, 2] + vertices[c, 2]) * third
+        i, j, k = int((x - low[0]) * inv_size), int((y - low[1]) * inv_size), int((z - low[2]) * inv_size)
+        if i < 1 or j < 1 or k < 1 or i >= nx - 1 or j >= ny - 1 or k >= nz - 1:
+            continue
+        if marks[i, j, k] == EXPLAINED + 2:
+            continue
+        for u in range(i - 1, i + 2):
+            for v in range(j - 1, j + 2):
+                for w in range(k - 1, k + 2):
+                    if marks[u, v, w] == OPEN:
+                        marks[u, v, w] = EXPLAINED
+        marks[i, j, k] = EXPLAINED + 2  # its neighbours are done
+
+
+@njit(inline="always")
+def _cell(rotation, centre, intrinsics, row, column, d, low, inv_size, marks):
+    """Flat cell of the reading of one pixel; -1 outside the grid."""
+    nx, ny, nz = marks.shape
+    x = (column + np.float32(0.5) - intrinsics[2]) / intrinsics[0] * d
+    y = (row + np.float32(0.5) - intrinsics[3]) / intrinsics[1] * d
+    i = int(np.floor((rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * d + centre[0] - low[0]) * inv_size))
+    j = int(np.floor((rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * d + centre[1] - low[1]) * inv_size))
+    k = int(np.floor((rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * d + centre[2] - low[2]) * inv_size))
+    if i < 0 or j < 0 or k < 0 or i >= nx or j >= ny or k >= nz:
+        return -1
+    return (i * ny + j) * nz + k
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+def reading_cells(rotation, centre, intrinsics, depth, near, low, inv_size, marks, cells):
+    """cells (H, W) int64: flat cell of every reading that lies in a cell that is not EXPLAINED; -1 elsewhere."""
+    flat = marks.reshape(-1)
+    for row in prange(depth.shape[0]):
+        for column in range(depth.shape[1]):
+            d, cell = depth[row, column], np.int64(-1)
+            if d > near:
+                cell = _cell(rotation, centre, intrinsics, row, column, d, low, inv_size, marks)
+                if cell >= 0 and flat[cell] & 1:
+                    cell = -1
+            cells[row, column] = cell
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+def vote(points, rotation, centre, intrinsics, depth, near, tolerance, hidden, agree, other):
+    """Count, for points (N, 3), the frame's reading where they project, in agree or other (N,) int32.
+
+    It agrees within `tolerance` m of them. Behind them it is other, and so it is before them up to `hidden` m:
+    scatter around a surface that is nearer. A reading still nearer is of something that hides them, and says nothing.
+    """
+    height, width = depth.shape
+    for n in prange(len(points)):
+        dx, dy, dz = points[n, 0] - centre[0], points[n, 1] - centre[1], points[n, 2] - centre[2]
+        z = rotation[0, 2] * dx + rotation[1, 2] * dy + rotation[2, 2] * dz
+        if z <= near:
+            continue
+        u = intrinsics[0] * (rotation[0, 0] * dx + rotation[1, 0] * dy + rotation[2, 0] * dz) / z + intrinsics[2]
+        v = intrinsics[1] * (rotation[0, 1] * dx + rotation[1, 1] * dy + rotation[2, 1] * dz) / z + intrinsics[3]
+        if u < 0 or v < 0 or u >= width or v >= height:
+            continue
+        d = depth[int(v), int(u)]
+        if d <= 0:
+            continue
+        if abs(d - z) <= tolerance:
+            agree[n] += 1
+        elif d > z - hidden:
+            other[n] += 1
+
+
+@njit(cache=True)
+def sheet_faces(cells, own, depth, step, numbers, faces):
+    """Faces over a frame's pixels: (vertices, faces) found; `numbers` (H, W) int32 gets the vertex of a pixel, or -1.
+
+    own (H, W) bool: the pixel's cell is to be covered from this frame. Two triangles join four neighbouring
+    pixels that all have unexplained readings, of which the first is the frame's own, whose depths differ by at most
+    `step` times the depth. `faces` (F, 3) int32 has room for all.
+    """
+    height, width = depth.shape
+    num_vertices = num_faces = 0
+    numbers[:] = -1
+    for i in range(height - 1):
+        for j in range(width - 1):
+            if not own[i, j]:
+                continue
+            if cells[i, j] < 0 or cells[i, j + 1] < 0 or cells[i + 1, j] < 0 or cells[i + 1, j + 1] < 0:
+                continue
+            nearest = min(min(depth[i, j], depth[i, j + 1]), min(depth[i + 1, j], depth[i + 1, j + 1]))
+            farthest = max(max(depth[i, j], depth[i, j + 1]), max(depth[i + 1, j], depth[i + 1, j + 1]))
+            if farthest - nearest > step * nearest:
+                continue
+            for m in range(4):
+                if numbers[i + (m >> 1), j + (m & 1)] < 0:
+                    numbers[i + (m >> 1), j + (m & 1)] = num_vertices
+                    num_vertices += 1
+            a, b, c, d = numbers[i, j], numbers[i, j + 1], numbers[i + 1, j], numbers[i + 1, j + 1]
+            # Counter-clockwise for who looks along +z with y downwards: normals point at the camera.
+            faces[num_faces, 0], faces[num_faces, 1], faces[num_faces, 2] = a, c, b
+            faces[num_faces + 1, 0], faces[num_faces + 1, 1], faces[num_faces + 1, 2] = b, c, d
+            num_faces += 2
+    return num_vertices, num_faces
