@@ -2,39 +2,41 @@
 """Depth readings that no face explains: where they lie, what else the frames say there, and faces through them.
 
 `rotation` (3, 3) is camera -> world, `centre` (3,) m, `intrinsics` (fx, fy, cx, cy); all float32. `marks` (X, Y, Z)
-uint8 on cells of 1 / inv_size m from `low` (3,) up: OPEN, EXPLAINED (near a face) or WANTED (to be covered).
+uint8 on cells of 1 / inv_size m from `low` (3,) up: OPEN, or EXPLAINED (the lowest bit is set: near a face).
 """
 
 import numpy as np
 from numba import njit, prange
 
-OPEN, EXPLAINED, WANTED = np.uint8(0), np.uint8(1), np.uint8(2)
+OPEN, EXPLAINED = np.uint8(0), np.uint8(1)
+_DONE = np.uint8(3)  # explained, and so are the cells around it
 
 
-@njit(cache=True)
+@njit(parallel=True, cache=True)
 def mark_faces(vertices, faces, low, inv_size, marks):
-    """Set EXPLAINED in the cells of all vertices and face centres, and in the 26 around each."""
+    """Set EXPLAINED in the cells of all vertices and face centres, and in the 26 around each.
+
+    Tasks may write to one cell at a time: whoever comes last, its lowest bit is set.
+    """
     nx, ny, nz = marks.shape
-    for f in range(len(vertices) + len(faces)):
+    third = np.float32(1 / 3)
+    for f in prange(len(vertices) + len(faces)):
         if f < len(vertices):
             x, y, z = vertices[f, 0], vertices[f, 1], vertices[f, 2]
         else:
             a, b, c = faces[f - len(vertices), 0], faces[f - len(vertices), 1], faces[f - len(vertices), 2]
-            third = np.float32(1 / 3)
             x = (vertices[a, 0] + vertices[b, 0] + vertices[c, 0]) * third
             y = (vertices[a, 1] + vertices[b, 1] + vertices[c, 1]) * third
             z = (vertices[a, 2] + vertices[b, 2] + vertices[c, 2]) * third
         i, j, k = int((x - low[0]) * inv_size), int((y - low[1]) * inv_size), int((z - low[2]) * inv_size)
-        if i < 1 or j < 1 or k < 1 or i >= nx - 1 or j >= ny - 1 or k >= nz - 1:
-            continue
-        if marks[i, j, k] == EXPLAINED + 2:
+        if i < 1 or j < 1 or k < 1 or i >= nx - 1 or j >= ny - 1 or k >= nz - 1 or marks[i, j, k] == _DONE:
             continue
         for u in range(i - 1, i + 2):
             for v in range(j - 1, j + 2):
                 for w in range(k - 1, k + 2):
                     if marks[u, v, w] == OPEN:
                         marks[u, v, w] = EXPLAINED
-        marks[i, j, k] = EXPLAINED + 2  # its neighbours are done
+        marks[i, j, k] = _DONE
 
 
 @njit(inline="always")

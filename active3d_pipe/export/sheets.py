@@ -16,6 +16,7 @@ from active3d_pipe.structures import Frame, TriangleMesh, VoxelGrid
 
 CELL = 1.25  # edge of a cell, in marching-cubes cells: a reading is explained within one to two of them from a face
 HIDDEN = 4.0  # cells before a point up to which a reading is taken for scatter, not for something that hides it
+FAR_M = 3.0  # up to there pixels are so dense that no cell is skipped when some are
 FOOTPRINTS = 3.0  # neighbouring pixels belong to one sheet when their depths differ by less than so many pixels
 
 
@@ -55,7 +56,8 @@ def _wanted(
     """Flat cells to be covered, ascending, and for each the index of the frame that covers it."""
     found = []
     for index, frame in enumerate(frames):
-        cells, depth = _reading_cells(frame, grid, marks), frame.depth
+        stride = min(max(int(grid.voxel_size * frame.camera.fx / FAR_M), 1), 2)
+        cells, depth = _reading_cells(frame, grid, marks, stride)
         at = cells >= 0
         # The nearest reading of every cell.
         order = np.lexsort((depth[at], cells[at]))
@@ -78,28 +80,35 @@ def _wanted(
     return cells[keep], owners[keep]
 
 
-def _reading_cells(frame: Frame, grid: VoxelGrid, marks: np.ndarray) -> np.ndarray:
-    cells = np.empty(frame.depth.shape, np.int64)
+def _reading_cells(
+    frame: Frame, grid: VoxelGrid, marks: np.ndarray, stride: int = 1
+) -> tuple[np.ndarray, np.ndarray]:
+    """Flat cells (h, w) of the unexplained among every `stride`-th reading, -1 elsewhere, and those readings."""
+    rotation, centre, intrinsics = frame_arrays(frame)
+    depth = np.ascontiguousarray(frame.depth[::stride, ::stride])
+    thin = intrinsics / np.float32(stride)
+    thin[2:] += np.float32(0.5 - 0.5 / stride)  # centres of the pixels taken
+    cells = np.empty(depth.shape, np.int64)
     kernels.reading_cells(
-        *frame_arrays(frame), frame.depth, np.float32(frame.camera.near), grid.origin.astype(np.float32),
+        rotation, centre, thin, depth, np.float32(frame.camera.near), grid.origin.astype(np.float32),
         np.float32(1 / grid.voxel_size), marks, cells,
     )
-    return cells
+    return cells, depth
 
 
 def _lay(frame: Frame, grid: VoxelGrid, marks: np.ndarray, owned: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Faces over the pixels of one frame whose readings lie in the cells `owned`: vertices (world, m) and faces."""
-    cells = _reading_cells(frame, grid, marks)
+    cells, depth = _reading_cells(frame, grid, marks)
     own = np.zeros(cells.shape, bool)
     at = cells >= 0
     own[at] = np.isin(cells[at], owned)
     numbers, faces = np.empty(cells.shape, np.int32), np.empty((2 * int(own.sum()), 3), np.int32)
     step = np.float32(FOOTPRINTS / min(frame.camera.fx, frame.camera.fy))
-    _, num_faces = kernels.sheet_faces(cells, own, frame.depth, step, numbers, faces)
+    _, num_faces = kernels.sheet_faces(cells, own, depth, step, numbers, faces)
     rows, columns = np.nonzero(numbers >= 0)
     order = np.argsort(numbers[rows, columns])
     rows, columns = rows[order], columns[order]
     rotation, centre, (fx, fy, cx, cy) = frame_arrays(frame)
-    d = frame.depth[rows, columns]
+    d = depth[rows, columns]
     points = np.stack([(columns + np.float32(0.5) - cx) / fx * d, (rows + np.float32(0.5) - cy) / fy * d, d], axis=-1)
     return (points @ rotation.T + centre).astype(np.float32), faces[:num_faces].copy()
