@@ -48,7 +48,7 @@ class FieldSettings(Settings):
     sigma_prior_m: float = Field(0.3, gt=0, description="standard deviation of the SDF where nothing was seen, m")
     sigma_floor_m: float = Field(0.002, gt=0, description="smallest standard deviation of the SDF, m")
 
-    rays: int = Field(1024, gt=0, description="rays per iteration")
+    rays: int = Field(768, gt=0, description="rays per iteration")
     free_samples: int = Field(6, ge=0, description="stratified samples a ray between camera and truncation band")
     surface_samples: int = Field(9, gt=1, description="stratified samples a ray within the truncation band")
     behind_fraction: float = Field(

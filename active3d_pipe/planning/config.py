@@ -63,7 +63,7 @@ class PlanningSettings(Settings):
         4, ge=1, description="before it stops, the search is repeated with this many times the positions, targets and "
         "exactly scored views"
     )
-    max_steps_per_round: int = Field(20, ge=1, description="steps of one decision at most; longer paths are cut")
+    max_steps_per_round: int = Field(30, ge=1, description="steps of one decision at most; longer paths are cut")
     min_steps_per_round: int = Field(
         10, ge=1, description="a shorter path is continued to the next view, seen from its end"
     )

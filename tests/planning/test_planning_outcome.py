@@ -76,7 +76,8 @@ def test_predicted_gain_comes_true():
     """Executed decisions of a whole exploration: large promises bring large entropy drops."""
     world = box_world.two_rooms()
     decision = bootstrap_decision(se3.pose_from_yaw_pitch(np.array([0.8, 0.8, 1.2]), 0.3, 0.0), MOTION, SETTINGS)
-    settings = PlanningSettings(max_positions=150, rrt_iterations=100)
+    # Short rounds, so that something is left to be found in the twelfth.
+    settings = PlanningSettings(max_positions=150, rrt_iterations=100, max_steps_per_round=20)
     walked, pairs, last, whole = [], [], None, 0.0
     for k in range(12):
         for T in decision.path:
