@@ -17,7 +17,7 @@ TENSOR_TYPES = {  # NumPy's name of a type: safetensors' name, in the order in w
     "<u8": "U64", "<i8": "I64", "<f8": "F64", "<f4": "F32", "<u4": "U32", "<i4": "I32", "<f2": "F16", "<u2": "U16",
     "<i2": "I16", "|i1": "I8", "|u1": "U8", "|b1": "BOOL",
 }
-COMPRESSION_THREADS = 2  # compression lets other threads run; the bytes do not depend on their number
+COMPRESSION_THREADS = 4  # compression lets other threads run; the bytes do not depend on their number
 
 
 @contextmanager
