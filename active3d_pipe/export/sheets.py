@@ -57,21 +57,23 @@ def _wanted(
     found = []
     for index, frame in enumerate(frames):
         stride = min(max(int(grid.voxel_size * frame.camera.fx / FAR_M), 1), 2)
-        cells, depth = _reading_cells(frame, grid, marks, stride)
-        at = cells >= 0
-        # The nearest reading of every cell.
-        order = np.lexsort((depth[at], cells[at]))
-        inside, first = np.unique(cells[at][order], return_index=True)
-        found.append((inside, np.full(len(inside), index), depth[at][order][first]))
-    cells, owners, depths = (np.concatenate(part) for part in zip(*found, strict=True))
+        all_cells, depth = _reading_cells(frame, grid, marks, stride)
+        rows, columns = np.nonzero(all_cells >= 0)
+        inside, d = all_cells[rows, columns], depth[rows, columns]
+        order = np.lexsort((d, inside))  # the nearest reading of every cell
+        inside, first = np.unique(inside[order], return_index=True)
+        nearest = order[first]
+        points = _points(frame, rows[nearest] * stride, columns[nearest] * stride)
+        found.append((inside, np.full(len(inside), index), d[nearest], points))
+    cells, owners, depths, points = (np.concatenate(part) for part in zip(*found, strict=True))
     order = np.lexsort((owners, depths, cells))
     cells, first, counts = np.unique(cells[order], return_index=True, return_counts=True)
-    owners = owners[order][first]
+    owners, points = owners[order][first], points[order][first]
     keep = counts >= settings.sheet_frames
-    cells, owners = cells[keep], owners[keep]
-    points = grid.centre_of(np.stack(np.unravel_index(cells, grid.shape), axis=-1)).astype(np.float32)
+    cells, owners, points = cells[keep], owners[keep], np.ascontiguousarray(points[keep])
     agree, other = np.zeros(len(cells), np.int32), np.zeros(len(cells), np.int32)
     for frame in frames:
+        # Asked about the reading itself, not the middle of its cell: what is thin may pass beside that.
         kernels.vote(
             points, *frame_arrays(frame), frame.depth, np.float32(frame.camera.near), np.float32(grid.voxel_size),
             np.float32(HIDDEN * grid.voxel_size), agree, other,
@@ -107,8 +109,12 @@ def _lay(frame: Frame, grid: VoxelGrid, marks: np.ndarray, owned: np.ndarray) ->
     _, num_faces = kernels.sheet_faces(cells, own, depth, step, numbers, faces)
     rows, columns = np.nonzero(numbers >= 0)
     order = np.argsort(numbers[rows, columns])
-    rows, columns = rows[order], columns[order]
+    return _points(frame, rows[order], columns[order]), faces[:num_faces].copy()
+
+
+def _points(frame: Frame, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """(N, 3) float32 readings of some pixels, world, m."""
     rotation, centre, (fx, fy, cx, cy) = frame_arrays(frame)
-    d = depth[rows, columns]
+    d = frame.depth[rows, columns]
     points = np.stack([(columns + np.float32(0.5) - cx) / fx * d, (rows + np.float32(0.5) - cy) / fy * d, d], axis=-1)
-    return (points @ rotation.T + centre).astype(np.float32), faces[:num_faces].copy()
+    return (points @ rotation.T + centre).astype(np.float32)
