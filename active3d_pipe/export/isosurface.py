@@ -145,12 +145,12 @@ def _weld(mesh: TriangleMesh, keys: np.ndarray, block: int) -> TriangleMesh:
 
 def keep_faces(mesh: TriangleMesh, keep: np.ndarray) -> TriangleMesh:
     """The mesh of the faces with `keep` (F,) bool, without unused vertices."""
-    used = np.zeros(len(mesh.vertices), bool)
-    faces = mesh.faces[keep]
-    used[faces.reshape(-1)] = True
-    renumber = (np.cumsum(used) - 1).astype(np.int32)
+    numbers = np.full(len(mesh.vertices), -1, np.int32)
+    faces = np.empty((int(np.count_nonzero(keep)), 3), np.int32)
+    kernels.keep_faces(mesh.faces, keep, numbers, faces)
+    used = numbers >= 0
     colors = None if mesh.colors is None else mesh.colors[used]
-    return TriangleMesh(mesh.vertices[used], renumber[faces].reshape(-1, 3), colors)
+    return TriangleMesh(mesh.vertices[used], faces, colors)
 
 
 def drop_small_components(mesh: TriangleMesh, min_area_m2: float) -> TriangleMesh:

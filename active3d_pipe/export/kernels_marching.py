@@ -207,3 +207,27 @@ def component_areas(vertices, faces, labels, areas):
             b[d] = vertices[faces[f, 2], d] - origin
         x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
         areas[labels[faces[f, 0]]] += 0.5 * np.sqrt(x * x + y * y + z * z)
+
+
+@njit(cache=True)
+def keep_faces(faces, keep, numbers, kept):
+    """Renumber what stays: numbers (V,) int32 = -1 gets the new number of every used vertex, in the old order.
+
+    kept (F', 3) int32 gets the faces (F, 3) with `keep` (F,) bool; returns the number of vertices used.
+    """
+    count = 0
+    for f in range(len(faces)):
+        if keep[f]:
+            for m in range(3):
+                kept[count, m] = faces[f, m]
+                numbers[faces[f, m]] = 0
+            count += 1
+    used = 0
+    for v in range(len(numbers)):
+        if numbers[v] == 0:
+            numbers[v] = used
+            used += 1
+    for f in range(count):
+        for m in range(3):
+            kept[f, m] = numbers[kept[f, m]]
+    return used

@@ -124,6 +124,19 @@ def grow_faces(faces, rings, num_vertices, seen):
             seen[f] = touched[faces[f, 0]] or touched[faces[f, 1]] or touched[faces[f, 2]]
 
 
+@njit(parallel=True, cache=True)
+def widen(marks, reach, out):
+    """out (A, B, C) bool: whether a mark at most `reach` places away along the middle axis is set."""
+    length = marks.shape[1]
+    for a in prange(marks.shape[0]):
+        out[a] = marks[a]
+        for b in range(length):
+            for other in range(max(b - reach, 0), min(b + reach + 1, length)):
+                if other != b:
+                    for c in range(marks.shape[2]):
+                        out[a, b, c] |= marks[a, other, c]
+
+
 @njit(fastmath=True, cache=True)
 def mark_readings(rotation, centre, intrinsics, depth, stride, join, low, inv_size, marks):
     """Mark the cells of `marks` (X, Y, Z) bool, lowest corner `low` (3,), that a depth reading lies in.

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.ndimage import binary_dilation
 
 from active3d_pipe.export import kernels_views as kernels
 from active3d_pipe.export.config import MeshSettings
@@ -35,11 +34,12 @@ def near_readings(
         kernels.mark_readings(
             *frame_arrays(frame), frame.depth, READING_STRIDE, np.float32(JOIN), origin, np.float32(1 / cell_m), marks
         )
-    if dilate:
-        for axis in range(3):  # a box separates into its three axes
-            shape = [1, 1, 1]
-            shape[axis] = 3
-            marks = binary_dilation(marks, structure=np.ones(shape, bool), iterations=dilate)
+    if dilate:  # a box separates into its three axes
+        x, y, z = marks.shape
+        for shape in ((1, x, y * z), (x, y, z), (x * y, z, 1)):
+            grown = np.empty(shape, bool)
+            kernels.widen(marks.reshape(shape), dilate, grown)
+            marks = grown.reshape(x, y, z)
     return grid, marks
 
 
