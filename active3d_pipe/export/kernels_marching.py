@@ -213,7 +213,7 @@ def component_areas(vertices, faces, labels, areas):
 def keep_faces(faces, keep, numbers, kept):
     """Renumber what stays: numbers (V,) int32 = -1 gets the new number of every used vertex, in the old order.
 
-    kept (F', 3) int32 gets the faces (F, 3) with `keep` (F,) bool; returns the number of vertices used.
+    kept (F', 3) int32 gets the faces (F, 3) with `keep` (F,) bool.
     """
     count = 0
     for f in range(len(faces)):
@@ -230,4 +230,3 @@ def keep_faces(faces, keep, numbers, kept):
     for f in range(count):
         for m in range(3):
             kept[f, m] = numbers[kept[f, m]]
-    return used

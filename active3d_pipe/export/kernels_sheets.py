@@ -95,7 +95,7 @@ def vote(points, rotation, centre, intrinsics, depth, near, tolerance, hidden, a
 
 @njit(cache=True)
 def sheet_faces(cells, own, depth, step, numbers, faces):
-    """Faces over a frame's pixels: (vertices, faces) found; `numbers` (H, W) int32 gets the vertex of a pixel, or -1.
+    """Faces over a frame's pixels, and their number; `numbers` (H, W) int32 gets the vertex of a pixel, or -1.
 
     own (H, W) bool: the pixel's cell is to be covered from this frame. Two triangles join four neighbouring
     pixels that all have unexplained readings, of which the first is the frame's own, whose depths differ by at most
@@ -123,4 +123,4 @@ def sheet_faces(cells, own, depth, step, numbers, faces):
             faces[num_faces, 0], faces[num_faces, 1], faces[num_faces, 2] = a, c, b
             faces[num_faces + 1, 0], faces[num_faces + 1, 1], faces[num_faces + 1, 2] = b, c, d
             num_faces += 2
-    return num_vertices, num_faces
+    return num_faces

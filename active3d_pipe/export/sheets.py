@@ -106,7 +106,7 @@ def _lay(frame: Frame, grid: VoxelGrid, marks: np.ndarray, owned: np.ndarray) ->
     own[at] = np.isin(cells[at], owned)
     numbers, faces = np.empty(cells.shape, np.int32), np.empty((2 * int(own.sum()), 3), np.int32)
     step = np.float32(FOOTPRINTS / min(frame.camera.fx, frame.camera.fy))
-    _, num_faces = kernels.sheet_faces(cells, own, depth, step, numbers, faces)
+    num_faces = kernels.sheet_faces(cells, own, depth, step, numbers, faces)
     rows, columns = np.nonzero(numbers >= 0)
     order = np.argsort(numbers[rows, columns])
     return _points(frame, rows[order], columns[order]), faces[:num_faces].copy()
