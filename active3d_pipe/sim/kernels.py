@@ -21,13 +21,12 @@ _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 
 @njit(inline="always")
 def _bilinear(texels, offset, width, height, u, v):
-    """RGB in 0..255 at (u, v) of one mip level that repeats."""
-    x = (u - np.float32(math.floor(u))) * np.float32(width) - _HALF
-    y = (v - np.float32(math.floor(v))) * np.float32(height) - _HALF
-    fx, fy = np.float32(math.floor(x)), np.float32(math.floor(y))
+    """RGB in 0..255 at (u, v) in 0..1 of one mip level that repeats."""
+    x, y = u * np.float32(width) - _HALF, v * np.float32(height) - _HALF
+    fx, fy = np.floor(x), np.floor(y)
     ax, ay = x - fx, y - fy
     # u - floor(u) may round up to 1, so both ends are guarded.
-    x0, y0 = np.int64(fx), np.int64(fy)
+    x0, y0 = np.int64(np.int32(fx)), np.int64(np.int32(fy))
     x1, y1 = x0 + 1, y0 + 1
     x0, x1 = x0 + width if x0 < 0 else x0, x1 - width if x1 >= width else x1
     y0, y1 = y0 + height if y0 < 0 else y0, y1 - height if y1 >= height else y1
@@ -35,14 +34,14 @@ def _bilinear(texels, offset, width, height, u, v):
     row0, row1 = offset + y0 * width, offset + y1 * width
     # Unsigned indices spare the test for negative ones. The three channels are blended along x at once, each in 21 bits
     # of one integer: 8 bits of value times 12 bits of weight.
-    w1 = np.int64(ax * np.float32(4096) + _HALF)
+    w1 = np.int64(np.int32(ax * np.float32(4096) + _HALF))
     w0 = np.int64(4096) - w1
     top = texels[np.uint64(row0 + x0)] * w0 + texels[np.uint64(row0 + x1)] * w1
     low = texels[np.uint64(row1 + x0)] * w0 + texels[np.uint64(row1 + x1)] * w1
     v0, v1 = (_ONE - ay) * _UNIT_WEIGHT, ay * _UNIT_WEIGHT
-    r = v0 * np.float32(top & _FIELD) + v1 * np.float32(low & _FIELD)
-    g = v0 * np.float32((top >> _GREEN) & _FIELD) + v1 * np.float32((low >> _GREEN) & _FIELD)
-    b = v0 * np.float32((top >> _BLUE) & _FIELD) + v1 * np.float32((low >> _BLUE) & _FIELD)
+    r = v0 * np.float32(np.int32(top & _FIELD)) + v1 * np.float32(np.int32(low & _FIELD))
+    g = v0 * np.float32(np.int32((top >> _GREEN) & _FIELD)) + v1 * np.float32(np.int32((low >> _GREEN) & _FIELD))
+    b = v0 * np.float32(np.int32((top >> _BLUE) & _FIELD)) + v1 * np.float32(np.int32((low >> _BLUE) & _FIELD))
     return r, g, b
 
 
@@ -62,7 +61,7 @@ def filtered_texture(texels, levels, first, last, u, v, ux, vx, uy, vy, bias, ma
         area = abs(ax * by - ay * bx)
         k = np.int64(_HALF * np.float32(math.log2(max(area, _ONE))) + bias + _HALF)
         k = first + min(max(k, 0), last - first - 1)
-        return _bilinear(texels, levels[k, 0], levels[k, 1], levels[k, 2], u, v)
+        return _bilinear(texels, levels[k, 0], levels[k, 1], levels[k, 2], u - np.floor(u), v - np.floor(v))
     # Axes of the ellipse J (unit disc), J = [a b]: eigen-decomposition of J J^T.
     e, f, g = ax * ax + bx * bx, ax * ay + bx * by, ay * ay + by * by
     mean, diff = _HALF * (e + g), _HALF * (e - g)
@@ -70,7 +69,8 @@ def filtered_texture(texels, levels, first, last, u, v, ux, vx, uy, vy, bias, ma
     long2, short2 = mean + root, max(mean - root, np.float32(1e-12))
     long, short = math.sqrt(long2), math.sqrt(short2)
     if long <= _ONE:
-        return _bilinear(texels, levels[first, 0], levels[first, 1], levels[first, 2], u, v)
+        return _bilinear(
+            texels, levels[first, 0], levels[first, 1], levels[first, 2], u - np.floor(u), v - np.floor(v))
     probes = min(np.int64(math.ceil(long / max(short, _ONE) - np.float32(1e-3))), max_probes)
     probes = max(probes, 1)
     extent = max(short, long / np.float32(probes), _ONE)
@@ -91,16 +91,18 @@ def filtered_texture(texels, levels, first, last, u, v, ux, vx, uy, vy, bias, ma
         cx, cy = _ONE, _ZERO
     su, sv = cx * long / width, cy * long / height
     r, gr, b = _ZERO, _ZERO, _ZERO
+    inv = _ONE / np.float32(probes)
+    offset, across, tall = levels[level, 0], levels[level, 1], levels[level, 2]
     for i in range(probes):
-        s = (np.float32(i) + _HALF) / np.float32(probes) - _HALF
+        s = (np.float32(i) + _HALF) * inv - _HALF
         pu, pv = u + s * su, v + s * sv
-        r0, g0, b0 = _bilinear(texels, levels[level, 0], levels[level, 1], levels[level, 2], pu, pv)
+        pu, pv = pu - np.floor(pu), pv - np.floor(pv)
+        r0, g0, b0 = _bilinear(texels, offset, across, tall, pu, pv)
         if blend > _SINGLE_LEVEL:
             k = level + 1
             r1, g1, b1 = _bilinear(texels, levels[k, 0], levels[k, 1], levels[k, 2], pu, pv)
             r0, g0, b0 = r0 + blend * (r1 - r0), g0 + blend * (g1 - g0), b0 + blend * (b1 - b0)
         r, gr, b = r + r0, gr + g0, b + b0
-    inv = _ONE / np.float32(probes)
     return r * inv, gr * inv, b * inv
 
 
@@ -111,12 +113,15 @@ def _grid_value(grid, origin, inv_voxel, x, y, z):
     gx = min(max((x - origin[0]) * inv_voxel - _HALF, _ZERO), np.float32(nx) - np.float32(1.001))
     gy = min(max((y - origin[1]) * inv_voxel - _HALF, _ZERO), np.float32(ny) - np.float32(1.001))
     gz = min(max((z - origin[2]) * inv_voxel - _HALF, _ZERO), np.float32(nz) - np.float32(1.001))
-    i, j, k = np.int64(gx), np.int64(gy), np.int64(gz)
+    i, j, k = np.int32(gx), np.int32(gy), np.int32(gz)
     a, b, c = gx - np.float32(i), gy - np.float32(j), gz - np.float32(k)
-    low = (grid[i, j, k] * (_ONE - a) + grid[i + 1, j, k] * a) * (_ONE - b) + (
-        grid[i, j + 1, k] * (_ONE - a) + grid[i + 1, j + 1, k] * a) * b
-    high = (grid[i, j, k + 1] * (_ONE - a) + grid[i + 1, j, k + 1] * a) * (_ONE - b) + (
-        grid[i, j + 1, k + 1] * (_ONE - a) + grid[i + 1, j + 1, k + 1] * a) * b
+    # Unsigned indices spare the test for negative ones.
+    i, j, k = np.uint64(i), np.uint64(j), np.uint64(k)
+    i1, j1, k1 = i + np.uint64(1), j + np.uint64(1), k + np.uint64(1)
+    low = (grid[i, j, k] * (_ONE - a) + grid[i1, j, k] * a) * (_ONE - b) + (
+        grid[i, j1, k] * (_ONE - a) + grid[i1, j1, k] * a) * b
+    high = (grid[i, j, k1] * (_ONE - a) + grid[i1, j, k1] * a) * (_ONE - b) + (
+        grid[i, j1, k1] * (_ONE - a) + grid[i1, j1, k1] * a) * b
     return low * (_ONE - c) + high * c
 
 
