@@ -56,7 +56,8 @@ class RasterSimulator(SurfaceRenderer):
         chosen = np.zeros(height * width + 1, np.int32)
         chosen[pixels + 1] = 1
         count = np.cumsum(chosen, dtype=np.int32)
-        before = count[np.arange(height)[:, None] * width + np.arange(width + 1)]
+        rows = np.lib.stride_tricks.as_strided(count, (height, width + 1), (width * count.itemsize, count.itemsize))
+        before = np.ascontiguousarray(rows)  # of each row also the count at its end
         shape = (len(pixels), len(self._offsets))
         seen = np.empty(shape, np.uint32)
         columns, farthest = (pixels % width).astype(np.int32), np.empty(len(pixels), np.float32)

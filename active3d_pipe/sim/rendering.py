@@ -80,10 +80,9 @@ class SurfaceRenderer(ABC):
         camera = self._camera
         hits = self._primary(T)
         rgb = self._colours(T, hits)
-        rgb8 = np.rint(rgb).astype(np.uint8).reshape(camera.height, camera.width, 3)
-        true_depth = np.where(np.isfinite(hits.t), hits.t, 0).reshape(camera.height, camera.width)
+        rgb8 = np.rint(rgb, out=rgb).astype(np.uint8).reshape(camera.height, camera.width, 3)
         rng = noise.frame_generator(self._seed, step)
-        depth = noise.apply_depth_sensor(true_depth, camera, self._settings, rng)
+        depth = noise.apply_depth_sensor(hits.t.reshape(camera.height, camera.width), camera, self._settings, rng)
         return Frame(step, stamp_ns, camera, T, rgb8, depth)
 
     def depth(self, T_world_camera: np.ndarray) -> np.ndarray:
