@@ -7,7 +7,7 @@ from scipy.ndimage import binary_dilation
 
 from active3d_pipe.export import kernels_correction as kernels
 from active3d_pipe.export.config import MeshSettings
-from active3d_pipe.geometry import projection
+from active3d_pipe.export.view_fusion import frame_arrays
 from active3d_pipe.geometry.sampling import spread
 from active3d_pipe.structures import Frame, VoxelGrid
 
@@ -15,6 +15,7 @@ STRIDE = 4  # of the pixels, every how many are compared with the field
 MOST_FRAMES = 200  # evenly spread, that are compared with the field
 MOST_FUSED = 128  # frames that are fused: those with the most readings that contradict
 LEAST_READINGS = 3  # in a cell, for their mean to count
+MOST_READINGS = 16  # in a cell, after which further frames are not asked about it
 
 
 def corrected_sdf(
@@ -72,26 +73,27 @@ def _disputed(
     origin, inv_cell = grid.origin.astype(np.float32), np.float32(1 / grid.voxel_size)
     sums, counts = np.zeros(grid.shape, np.float32), np.zeros(grid.shape, np.int32)
     compared = spread(frames, MOST_FRAMES)
-    against: list[int] = []
-    for frame in compared:
-        points = _readings(frame)
-        values = query_sdf(points) if len(points) else np.zeros(0, np.float32)
-        kernels.add_readings(points, values, origin, inv_cell, sums, counts)
-        against.append(int((np.abs(values) > settings.dispute_m).sum()))
+    against = np.zeros(len(compared), np.int64)
+    for index in _scattered(len(compared)):
+        frame = compared[index]
+        points = np.empty((frame.depth[::STRIDE, ::STRIDE].size, 3), np.float32)
+        reach = np.array([frame.camera.near, frame.camera.far], np.float32)
+        points = points[: kernels.open_readings(
+            *frame_arrays(frame), frame.depth, STRIDE, reach, origin, inv_cell, counts, MOST_READINGS, points
+        )]
+        if len(points):
+            values = query_sdf(points)
+            kernels.add_readings(points, values, origin, inv_cell, sums, counts)
+            against[index] = (np.abs(values) > settings.dispute_m).sum()
     mean = np.abs(sums) / np.maximum(counts, 1)
     marks = (counts >= LEAST_READINGS) & (mean > settings.dispute_m)
     if marks.any():
         marks = binary_dilation(marks, structure=np.ones((3, 3, 3), bool))
-    order = np.argsort(-np.array(against), kind="stable")[:MOST_FUSED]
+    order = np.argsort(-against, kind="stable")[:MOST_FUSED]
     return grid, marks, [compared[int(i)] for i in np.sort(order)]
 
 
-def _readings(frame: Frame) -> np.ndarray:
-    """(N, 3) float32 world points of every `STRIDE`-th reading in range."""
-    step = slice(STRIDE // 2, None, STRIDE)
-    depth = frame.depth[step, step]
-    rays = projection.pixel_rays(frame.camera)[step, step]
-    valid = (depth > frame.camera.near) & (depth < frame.camera.far)
-    T = frame.T_world_camera
-    points = (depth[..., None] * rays)[valid] @ T[:3, :3].T + T[:3, 3]
-    return np.ascontiguousarray(points, np.float32)
+def _scattered(count: int) -> list[int]:
+    """0 .. count - 1 in an order whose beginnings are spread evenly: by their bits, from the last to the first."""
+    bits = max(count - 1, 1).bit_length()
+    return sorted(range(count), key=lambda i: f"{i:0{bits}b}"[::-1])

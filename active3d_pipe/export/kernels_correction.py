@@ -9,6 +9,31 @@ from numba import njit, prange
 
 
 @njit(cache=True)
+def open_readings(rotation, centre, lens, depth, stride, reach, origin, inv_cell, counts, most, points):
+    """World points of every `stride`-th reading of depth (H, W) whose cell of `counts` holds less than `most`.
+
+    reach: (near, far), m, between which a reading counts. Into points (N, 3) f32; returns how many.
+    """
+    nx, ny, nz = counts.shape
+    height, width = depth.shape
+    count = 0
+    for i in range(stride // 2, height, stride):
+        for j in range(stride // 2, width, stride):
+            d = depth[i, j]
+            if not (d > reach[0] and d < reach[1]):
+                continue
+            x, y = (j + np.float32(0.5) - lens[2]) / lens[0] * d, (i + np.float32(0.5) - lens[3]) / lens[1] * d
+            for c in range(3):
+                points[count, c] = rotation[c, 0] * x + rotation[c, 1] * y + rotation[c, 2] * d + centre[c]
+            a = np.int64(np.floor((points[count, 0] - origin[0]) * inv_cell))
+            b = np.int64(np.floor((points[count, 1] - origin[1]) * inv_cell))
+            c = np.int64(np.floor((points[count, 2] - origin[2]) * inv_cell))
+            if 0 <= a < nx and 0 <= b < ny and 0 <= c < nz and counts[a, b, c] < most:
+                count += 1
+    return count
+
+
+@njit(cache=True)
 def add_readings(points, values, origin, inv_cell, sums, counts):
     """Add values (N,) f32 and 1 to the cells of sums (X, Y, Z) f32 and counts i32 that points (N, 3) lie in."""
     nx, ny, nz = counts.shape

@@ -137,15 +137,17 @@ def widen(marks, reach, out):
                         out[a, b, c] |= marks[a, other, c]
 
 
-@njit(fastmath=True, cache=True)
+@njit(parallel=True, fastmath=True, cache=True)
 def mark_readings(rotation, centre, intrinsics, depth, stride, join, low, inv_size, marks):
     """Mark the cells of `marks` (X, Y, Z) bool, lowest corner `low` (3,), that a depth reading lies in.
 
     Of `depth` (H, W) every `stride`-th pixel is read. Between neighbours whose depths differ by less than `join` of
-    their mean the line is marked too, so that a surface seen at a grazing angle leaves no gaps.
+    their mean the line is marked too, so that a surface seen at a grazing angle leaves no gaps. Tasks may mark the
+    same cell.
     """
     height, width = depth.shape
-    for i in range(0, height, stride):
+    for row in prange((height + stride - 1) // stride):
+        i = row * stride
         for j in range(0, width, stride):
             d = depth[i, j]
             if d <= 0:

@@ -23,6 +23,7 @@ F0, F1, HALF = np.float32(0), np.float32(1), np.float32(0.5)
 C3, C5, C15_16 = np.float32(2 / 3), np.float32(0.2), np.float32(15 / 16)
 CHUNK = 128
 GRID_SLABS = 4
+ONE = np.uintp(1)
 
 
 @njit(inline="always", fastmath=True)
@@ -180,7 +181,8 @@ def decode_points(
     """Encoding and a two-layer ReLU decoder in one pass, without gradients.
 
     w1 (3 bins + levels * channels + grid channels, hidden), b1 (hidden,), w2 (outputs, hidden), b2 (outputs,),
-    out (N, outputs). At most three bins of an axis are not zero, so OneBlob costs nine rows of w1, not 3 bins.
+    out (N, outputs); hidden is a multiple of 8, channels of 8, grid channels of 4. At most three bins of an axis are
+    not zero, so OneBlob costs nine rows of w1, not 3 bins.
     """
     n, hidden, outputs = points.shape[0], w1.shape[1], w2.shape[0]
     channels = planes.shape[1]
@@ -204,13 +206,13 @@ def decode_points(
                 w10 = fa - w11
                 w01 = fb - w11
                 w00 = F1 - fa - fb + w11
-                o = layout[q, 5] * channels
-                for c0 in range(0, channels, 8):
-                    for c in range(8):
-                        f[o + c0 + c] += (
-                            w00 * planes[node, c0 + c] + w01 * planes[node + 1, c0 + c]
-                            + w10 * planes[node + nb, c0 + c] + w11 * planes[node + nb + 1, c0 + c]
-                        )
+                o = np.uintp(layout[q, 5] * channels)
+                n00, n10 = np.uintp(node), np.uintp(node + nb)
+                n01, n11 = n00 + ONE, n10 + ONE
+                for c in range(channels):
+                    f[o + np.uintp(c)] += (
+                        w00 * planes[n00, c] + w01 * planes[n01, c] + w10 * planes[n10, c] + w11 * planes[n11, c]
+                    )
             i, fx = _cell(points[p, 0] - low[0], inv_grid, grid_first[0], nx)
             j, fy = _cell(points[p, 1] - low[1], inv_grid, grid_first[1], ny)
             m, fz = _cell(points[p, 2] - low[2], inv_grid, grid_first[2], nz)
@@ -225,20 +227,22 @@ def decode_points(
 
             for c in range(hidden):
                 h[c] = b1[c]
+            # Several rows at a time: adding to h is a chain of loads and stores, each waiting for the one before.
             for a in range(3):
                 x = (points[p, a] - blob_low[a]) * inv_extent[a]
                 x = min(max(x, F0), F1) * fbins
-                middle = min(np.int64(x), bins - 1)
-                for j in range(max(middle - 1, 0), min(middle + 2, bins)):
-                    v = _quartic_cdf(np.float32(j + 1) - x) - _quartic_cdf(np.float32(j) - x)
-                    row = a * bins + j
-                    for c in range(hidden):
-                        h[c] += v * w1[row, c]
-            for r in range(width + grid_channels):
-                v = f[r]
+                j = min(max(np.int64(x) - 1, 0), bins - 2)
+                e0, e1 = _quartic_cdf(np.float32(j) - x), _quartic_cdf(np.float32(j + 1) - x)
+                e2, e3 = _quartic_cdf(np.float32(j + 2) - x), _quartic_cdf(np.float32(j + 3) - x)
+                v0, v1, row = e1 - e0, e2 - e1, a * bins + j
+                v2, last = (e3 - e2, row + 2) if j + 2 < bins else (F0, row + 1)
+                for c in range(hidden):
+                    h[c] += v0 * w1[row, c] + v1 * w1[row + 1, c] + v2 * w1[last, c]
+            for r in range(0, width + grid_channels, 4):
+                v0, v1, v2, v3 = f[r], f[r + 1], f[r + 2], f[r + 3]
                 row = 3 * bins + r
                 for c in range(hidden):
-                    h[c] += v * w1[row, c]
+                    h[c] += v0 * w1[row, c] + v1 * w1[row + 1, c] + v2 * w1[row + 2, c] + v3 * w1[row + 3, c]
             for o in range(outputs):
                 s = b2[o]
                 for c in range(hidden):
