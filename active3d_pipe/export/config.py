@@ -13,7 +13,7 @@ class MeshSettings(Settings):
     voxel_size_m: float = Field(0.02, gt=0, description="edge of a marching-cubes cell, m")
     block_cells: int = Field(64, ge=8, multiple_of=2, description="edge of the blocks that bound the memory, cells")
     refine_margin: float = Field(
-        1.25, ge=1, description="a coarse cell is refined when a corner is within this many fine cells of the surface"
+        0.5, ge=0, description="a coarse cell is refined when a corner is within this many fine cells of the surface"
     )
     dilate_voxels: int = Field(
         1, ge=0, description="how far beyond the volume's surface voxels the preview may run, voxels"

@@ -1,13 +1,13 @@
 """The field's SDF, replaced by fused depth readings where these contradict it: thin parts that the field washes out."""
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from scipy.ndimage import binary_dilation
 
 from active3d_pipe.export import kernels_correction as kernels
 from active3d_pipe.export.config import MeshSettings
-from active3d_pipe.export.view_fusion import frame_arrays
+from active3d_pipe.export.view_fusion import dilated, frame_arrays
 from active3d_pipe.geometry.sampling import spread
 from active3d_pipe.structures import Frame, VoxelGrid
 
@@ -42,8 +42,11 @@ def corrected_sdf(
     origin, inv_cell = grid.origin.astype(np.float32), np.float32(1 / grid.voxel_size)
     poses = np.stack([f.T_world_camera for f in fused]).astype(np.float32)
     lenses = np.array([[f.camera.fx, f.camera.fy, f.camera.cx, f.camera.cy] for f in fused], np.float32)
+    depths = np.empty((len(fused), *fused[0].depth.shape), np.float32)
+    with ThreadPoolExecutor() as pool:  # a tenth of a gigabyte, whose fresh pages cost more than the copying
+        list(pool.map(np.copyto, depths, [f.depth for f in fused]))
     views = (
-        np.stack([f.depth for f in fused]), np.ascontiguousarray(poses[:, :3, :3]),
+        depths, np.ascontiguousarray(poses[:, :3, :3]),
         np.ascontiguousarray(poses[:, :3, 3]), lenses,
     )
     near = np.float32(min(f.camera.near for f in fused))
@@ -87,10 +90,8 @@ def _disputed(
             against[index] = (np.abs(values) > settings.dispute_m).sum()
     mean = np.abs(sums) / np.maximum(counts, 1)
     marks = (counts >= LEAST_READINGS) & (mean > settings.dispute_m)
-    if marks.any():
-        marks = binary_dilation(marks, structure=np.ones((3, 3, 3), bool))
     order = np.argsort(-against, kind="stable")[:MOST_FUSED]
-    return grid, marks, [compared[int(i)] for i in np.sort(order)]
+    return grid, dilated(marks, 1), [compared[int(i)] for i in np.sort(order)]
 
 
 def _scattered(count: int) -> list[int]:

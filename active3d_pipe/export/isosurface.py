@@ -45,7 +45,7 @@ def extract_mesh(
         loose pieces are dropped.
 
     A cell of two by two by two is refined when the signs at its corners differ or a corner is within `refine_margin`
-    fine cells of the surface: a plane through the cell passes its nearest corner within one.
+    fine cells of the surface: a plane through the cell parts its corners, a bent surface may pass between them.
     """
     low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
     if not (high > low).all():

@@ -34,13 +34,18 @@ def near_readings(
         kernels.mark_readings(
             *frame_arrays(frame), frame.depth, READING_STRIDE, np.float32(JOIN), origin, np.float32(1 / cell_m), marks
         )
-    if dilate:  # a box separates into its three axes
+    return grid, dilated(marks, dilate)
+
+
+def dilated(marks: np.ndarray, reach: int) -> np.ndarray:
+    """(X, Y, Z) bool, whether a mark lies at most `reach` places away along every axis."""
+    if reach:  # a box separates into its three axes
         x, y, z = marks.shape
         for shape in ((1, x, y * z), (x, y, z), (x * y, z, 1)):
             grown = np.empty(shape, bool)
-            kernels.widen(marks.reshape(shape), dilate, grown)
+            kernels.widen(marks.reshape(shape), reach, grown)
             marks = grown.reshape(x, y, z)
-    return grid, marks
+    return marks
 
 
 def cull_unseen(mesh: TriangleMesh, frames: Sequence[Frame], settings: MeshSettings) -> TriangleMesh:
