@@ -97,13 +97,8 @@ def known_free(
 
 def mark_body(free: np.ndarray, grid: VoxelGrid, centres_world: np.ndarray, radius_m: float) -> None:
     """Set `free` in every voxel whose centre lies within the radius of one of the positions (N, 3), in place."""
-    reach = int(np.ceil(radius_m / grid.voxel_size)) + 1
-    offsets = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    centres = np.asarray(centres_world, dtype=np.float64).reshape(-1, 3)
-    ijk = grid.index_of(centres)[:, None] + offsets
-    near = np.linalg.norm(grid.centre_of(ijk) - centres[:, None], axis=-1) <= radius_m
-    ijk = ijk[near & grid.contains_index(ijk)]
-    free[tuple(ijk.T)] = True
+    centres = np.ascontiguousarray(centres_world, dtype=np.float64).reshape(-1, 3)
+    kernels.mark_spheres(centres, radius_m, np.asarray(grid.origin, dtype=np.float64), grid.voxel_size, free)
 
 
 def clearance(free: np.ndarray, voxel_size: float, longest_m: float) -> np.ndarray:

@@ -1,6 +1,8 @@
 # mypy: ignore-errors
 """Numba kernels on the voxel grid: truncated distance transforms, geodesic distances."""
 
+import math
+
 import numpy as np
 from numba import njit, prange
 
@@ -157,3 +159,24 @@ def geodesic(passable, rate, start, voxel_size, planar, limit):
                             ids = np.concatenate((ids, np.empty(len(ids), np.int32)))
                         n = _push(keys, ids, n, new, (x * ny + y) * nz + z)
     return cost, parent
+
+
+@njit(cache=True)
+def mark_spheres(centres, radius, origin, size, out):
+    """Set out (X, Y, Z) bool in every voxel whose centre lies within `radius` of one of the centres (N, 3) float64.
+
+    origin (3,) float64 m, lowest corner of the grid; size: edge of a voxel, m.
+    """
+    low, high = np.empty(3, np.int64), np.empty(3, np.int64)
+    for n in range(centres.shape[0]):
+        for a in range(3):
+            low[a] = max(math.floor((centres[n, a] - radius - origin[a]) / size), 0)
+            high[a] = min(math.floor((centres[n, a] + radius - origin[a]) / size) + 1, out.shape[a])
+        for i in range(low[0], high[0]):
+            dx = origin[0] + (i + 0.5) * size - centres[n, 0]
+            for j in range(low[1], high[1]):
+                dy = origin[1] + (j + 0.5) * size - centres[n, 1]
+                for k in range(low[2], high[2]):
+                    dz = origin[2] + (k + 0.5) * size - centres[n, 2]
+                    if math.sqrt(dx * dx + dy * dy + dz * dz) <= radius:
+                        out[i, j, k] = True
