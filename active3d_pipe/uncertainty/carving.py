@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from active3d_pipe.structures import Camera, Frame, VoxelGrid
-from active3d_pipe.uncertainty import kernels
+from active3d_pipe.uncertainty import kernels_carving as kernels
 from active3d_pipe.uncertainty.config import UncertaintySettings
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from active3d_pipe.errors import InputError
-from active3d_pipe.geometry import projection, se3
+from active3d_pipe.geometry import projection
 from active3d_pipe.structures import Camera, Frame, VoxelGrid
 from active3d_pipe.structures.frame import check_pose
 from active3d_pipe.uncertainty import kernels
@@ -109,17 +109,12 @@ def most_uncertain(
     The volume of the last round decides, so that only the chosen views have to be rendered.
     """
     means = []
-    flat, thinned = u_exp.ravel(), (slice(CHOICE_STRIDE // 2, None, CHOICE_STRIDE),) * 2
-    rays: dict[Camera, np.ndarray] = {}
     for frame in frames:
-        if frame.camera not in rays:
-            rays[frame.camera] = projection.pixel_rays(frame.camera)[thinned]
-        depth = frame.depth[thinned]
-        points = (rays[frame.camera] * depth[..., None])[depth > 0]
-        ijk = grid.index_of(se3.transform_points(frame.T_world_camera, points.astype(np.float64)))
-        ijk = ijk[grid.contains_index(ijk)]
-        voxels = np.ravel_multi_index(tuple(ijk.T), grid.shape)
-        means.append(float(flat[voxels].mean(dtype=np.float64)) if len(voxels) else 0.0)
+        c, pose = frame.camera, np.ascontiguousarray(frame.T_world_camera[:3], dtype=np.float64)
+        means.append(kernels.mean_at_readings(
+            frame.depth, (c.fx, c.fy, c.cx, c.cy), pose, CHOICE_STRIDE // 2, CHOICE_STRIDE, grid.origin,
+            grid.voxel_size, u_exp,
+        ))
     order = np.argsort(-np.asarray(means), kind="stable")
     return [int(i) for i in order[: settings.top_k_views]]
 
