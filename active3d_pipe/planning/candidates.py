@@ -12,8 +12,8 @@ from active3d_pipe.planning.free_space import FreeSpace
 from active3d_pipe.planning.kernels_candidates import best_of_blocks
 from active3d_pipe.structures.camera import Camera
 
-# Rays of the sphere: rows of elevation x columns of azimuth, 7.5 degrees apart.
-NUM_AZIMUTHS, NUM_ELEVATIONS = 48, 24
+# Rays of the sphere: rows of elevation and twice as many columns of azimuth, 7.5 degrees apart.
+NUM_ELEVATIONS = 24
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,12 +37,15 @@ class Directions:
 
 
 @lru_cache(maxsize=4)
-def view_directions(camera: Camera, num_yaws: int, pitches_deg: tuple[float, ...]) -> Directions:
+def view_directions(
+    camera: Camera, num_yaws: int, pitches_deg: tuple[float, ...], num_elevations: int = NUM_ELEVATIONS
+) -> Directions:
     """Level views: `num_yaws` evenly spread times `pitches_deg` (up > 0), on a sphere of rays. Pure, so cached."""
-    azimuth = (np.arange(NUM_AZIMUTHS) + 0.5) * (2 * math.pi / NUM_AZIMUTHS) - math.pi
-    edges = np.linspace(-math.pi / 2, math.pi / 2, NUM_ELEVATIONS + 1)
+    num_azimuths = 2 * num_elevations
+    azimuth = (np.arange(num_azimuths) + 0.5) * (2 * math.pi / num_azimuths) - math.pi
+    edges = np.linspace(-math.pi / 2, math.pi / 2, num_elevations + 1)
     elevation = 0.5 * (edges[1:] + edges[:-1])
-    band = (np.sin(edges[1:]) - np.sin(edges[:-1])) * (2 * math.pi / NUM_AZIMUTHS)
+    band = (np.sin(edges[1:]) - np.sin(edges[:-1])) * (2 * math.pi / num_azimuths)
     el, az = (a.ravel() for a in np.meshgrid(elevation, azimuth, indexing="ij"))
     rays = np.stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)], axis=-1)
     yaw_steps = np.arange(num_yaws) * (2 * math.pi / num_yaws) - math.pi
@@ -57,7 +60,7 @@ def view_directions(camera: Camera, num_yaws: int, pitches_deg: tuple[float, ...
     u, v = camera.fx * local[..., 0] / z + camera.cx, camera.fy * local[..., 1] / z + camera.cy
     members = (local[..., 2] > 1e-6) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
     return Directions(
-        rays.astype(np.float32), np.repeat(band, NUM_AZIMUTHS).astype(np.float32), rotations, yaws, pitches,
+        rays.astype(np.float32), np.repeat(band, num_azimuths).astype(np.float32), rotations, yaws, pitches,
         members.astype(np.float32), angles,
     )
 

@@ -1,6 +1,7 @@
 """Scoring all candidates and choosing among them: gain against the steps it costs."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,10 +12,14 @@ from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.free_space import FreeSpace
 from active3d_pipe.planning.kernels_candidates import spread_values
 from active3d_pipe.planning.reward import RewardField, exact_terms, sphere_rewards
-from active3d_pipe.planning.targets import target_positions
+from active3d_pipe.planning.targets import hidden_positions, target_positions
 from active3d_pipe.structures.camera import Camera
 from active3d_pipe.structures.decision import Decision, ScoredCandidate
 from active3d_pipe.structures.motion import MotionSettings
+
+# Where hidden space was searched: how many positions for each exactly scored view are estimated a second time, and the
+# rows of rays they are estimated with.
+SECOND_LOOKS, FINE_ELEVATIONS = 4, 48
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,7 +82,7 @@ def positions_world(space: FreeSpace, voxels: np.ndarray, T_world_camera: np.nda
     return out
 
 
-def score(
+def score(  # noqa: PLR0913  (what a decision knows, by name)
     space: FreeSpace,
     field: RewardField,
     T_world_camera: np.ndarray,
@@ -85,8 +90,14 @@ def score(
     motion: MotionSettings,
     settings: PlanningSettings,
     previous: Decision | None,
+    *,
+    hidden_pairs: int = 0,
+    turns: Sequence[int] = (),
 ) -> Pool:
-    """Score every view of the reachable space, coarse to fine, and the best ones exactly."""
+    """Score every view of the reachable space, coarse to fine, and the best ones exactly.
+
+    `hidden_pairs`, `turns`: how thoroughly unseen space is searched for what few places see (`hidden_positions`).
+    """
     R = T_world_camera[:3, :3]
     directions = view_directions(camera, settings.num_yaws, settings.pitches_deg)
     num_views = len(directions.rotations)
@@ -100,7 +111,9 @@ def score(
 
     # The place where the agent stands is always a candidate: turning is the cheapest motion.
     seeing = target_positions(space, field, motion, settings)
-    voxels = np.unique(np.concatenate([space.start[None], coarse_positions(space, settings), seeing]), axis=0)
+    hidden = [hidden_positions(space, field, motion, settings, hidden_pairs, turn) for turn in turns]
+    voxels = np.concatenate([space.start[None], coarse_positions(space, settings), seeing, *hidden])
+    voxels = np.unique(voxels, axis=0)
     rewards = sphere_rewards(field, positions_world(space, voxels, T_world_camera), directions)
     utility = utilities(voxels, rewards)
     top = np.argsort(-utility.max(axis=1), kind="stable")[: settings.refine_top]
@@ -110,6 +123,12 @@ def score(
         fine_rewards = sphere_rewards(field, positions_world(space, fine, T_world_camera), directions)
         voxels, rewards = np.concatenate([voxels, fine]), np.concatenate([rewards, fine_rewards])
         utility = np.concatenate([utility, utilities(fine, fine_rewards)])
+    num_candidates = rewards.size
+    if turns:
+        again = _worth_another_look(rewards, utility, SECOND_LOOKS * settings.exact_top)
+        voxels, finer = voxels[again], view_directions(camera, settings.num_yaws, settings.pitches_deg, FINE_ELEVATIONS)
+        rewards = sphere_rewards(field, positions_world(space, voxels, T_world_camera), finer)
+        utility = utilities(voxels, rewards)
     chosen = _shortlist(voxels, rewards, utility, directions, settings)
     poses = np.stack([np.eye(4)] * len(chosen)) if chosen else np.zeros((0, 4, 4))
     at = np.array([p for p, _ in chosen], dtype=np.int64)
@@ -131,8 +150,18 @@ def score(
     order = np.argsort(-final, kind="stable")
     return Pool(
         poses[order], goal_voxels[order], [terms[i] for i in order], travel[order], final[order], committed[order],
-        rewards.size, voxels, rewards.max(axis=1),
+        num_candidates, voxels, rewards.max(axis=1),
     )
+
+
+def _worth_another_look(rewards: np.ndarray, utility: np.ndarray, most: int) -> np.ndarray:
+    """Ascending indices of at most `most` positions (P, V): half by their best reward, half by their best utility.
+
+    Through a gap of a few voxels one ray of a sphere sees far more than its solid angle holds, or nothing: the best of
+    thousands of such estimates is an accident, unless those that lead are estimated again with other rays.
+    """
+    leaders = [np.argsort(-ranking.max(axis=1), kind="stable")[: most // 2] for ranking in (rewards, utility)]
+    return np.unique(np.concatenate(leaders))
 
 
 def _shortlist(

@@ -63,6 +63,14 @@ class PlanningSettings(Settings):
         4, ge=1, description="before it stops, the search is repeated with this many times the positions, targets and "
         "exactly scored views"
     )
+    hidden_reward: float = Field(
+        30.0, ge=0, description="once the best view promises less than this, unseen space is searched for what few "
+        "places can see; 0 = only before the stop"
+    )
+    hidden_pairs: int = Field(
+        10_000_000, ge=1, description="pairs of a place and a block of unseen space that one such search tries; before "
+        "the stop fifty times as many"
+    )
     max_steps_per_round: int = Field(30, ge=1, description="steps of one decision at most; longer paths are cut")
     min_steps_per_round: int = Field(
         10, ge=1, description="a shorter path is continued to the next view, seen from its end"

@@ -43,6 +43,8 @@ class _Task:
         return self.settings.max_steps_per_round * self.motion.max_step_m
 
 
+# Times the pairs of the quick search for hidden space in the thorough one.
+THOROUGH_PAIRS = 50
 # Views that are appended to a short path at most.
 LONGEST_CHAIN = 4
 
@@ -99,12 +101,18 @@ def _choose(
     """The decision itself, without the account of predicted and realised gain."""
     T, camera, motion, settings = task.T, task.camera, task.motion, task.settings
     best = 0.0
+    before = np.inf if previous is None else previous.terms.get("best_reward", np.inf)
+    turns = (task.round,) if before < settings.hidden_reward else ()
     # The quick search overlooks what few views can see; only a thorough one may say that nothing is left.
     for relaxed, thorough in ((False, False), (False, True), (True, False)):
         if relaxed:
             space = build_free_space(volume, T, walked[:, :3, 3], motion, settings, relaxed=True)
         how = _thorough(settings) if thorough else settings
-        pool = score(space, field, T, camera, motion, how, previous)
+        pairs = settings.hidden_pairs * (THOROUGH_PAIRS if thorough else 1)
+        both = (task.round, task.round + 1)
+        pool = score(
+            space, field, T, camera, motion, how, previous, hidden_pairs=pairs, turns=both if thorough else turns
+        )
         best = max((t.reward for t in pool.terms), default=0.0)
         if best >= settings.stop_reward:
             decision = _go(task, space, pool, field, Reason.RELAXED if relaxed else Reason.BEST_GAIN)

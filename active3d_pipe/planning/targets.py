@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from active3d_pipe.information.gain import FREE, SURFACE
+from active3d_pipe.information.gain import FREE, OPEN, SURFACE
 from active3d_pipe.planning import kernels_targets
 from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.free_space import FreeSpace
@@ -20,10 +20,35 @@ def target_positions(
     A lattice of positions misses what can be seen through a gap only. Here one asks the other way round: blocks of
     `target_block_m` with the most that is still to be had, and from where each is seen best and soonest.
     """
-    grid = space.grid
     targets, cells = _targets(field, settings)
-    lattice = tuple(slice(o % 2, None, 2) for o in space.start)
-    places = np.argwhere(space.reachable[lattice]) * 2 + np.array([o % 2 for o in space.start])
+    return _viewpoints(space, field, motion, settings, targets, cells, space.start % 2)
+
+
+def hidden_positions(
+    space: FreeSpace, field: RewardField, motion: MotionSettings, settings: PlanningSettings, pairs: int, turn: int
+) -> np.ndarray:
+    """(P, 3) int64 reachable voxels from which something deep in unseen space can be seen, past all that is nearer.
+
+    `target_positions` asks for the rim of what is unseen, which many places see; behind furniture the rest is seen
+    from a few only. Every block of unseen space is asked about, or as many, evenly spread, as with all places of a
+    lattice make up `pairs`; there are two lattices, one in the middle of the other's cells. Which of them is taken, and
+    which blocks, changes with `turn`.
+    """
+    targets = _unseen_blocks(field, settings)
+    offset = (space.start + turn) % 2
+    every = -(-len(targets) * (int(space.reachable.sum()) // 8 + 1) // max(pairs, 1))
+    targets = targets[turn % max(every, 1) :: max(every, 1)]
+    return _viewpoints(space, field, motion, settings, targets, np.zeros(len(targets), np.uint8), offset)
+
+
+def _viewpoints(
+    space: FreeSpace, field: RewardField, motion: MotionSettings, settings: PlanningSettings, targets: np.ndarray,
+    cells: np.ndarray, offset: np.ndarray,
+) -> np.ndarray:
+    """(P, 3) int64, of the reachable voxels `offset` + 2 (i, j, k) those that see a target (T, 3) best or soonest."""
+    grid = space.grid
+    lattice = tuple(slice(int(o), None, 2) for o in offset)
+    places = np.argwhere(space.reachable[lattice]) * 2 + offset
     if len(targets) == 0 or len(places) == 0:
         return np.zeros((0, 3), np.int64)
     enough = settings.information.enough_distance_m
@@ -35,6 +60,18 @@ def target_positions(
     )
     chosen = np.unique(near[near >= 0])
     return places[chosen]
+
+
+def _unseen_blocks(field: RewardField, settings: PlanningSettings) -> np.ndarray:
+    """(T, 3) int64: of every block the open voxel with the most value."""
+    grid = field.grid
+    worth = np.where(field.kind == OPEN, field.value, 0)
+    ids = np.flatnonzero(worth > 0)
+    ijk = np.stack(np.unravel_index(ids, grid.shape), axis=-1)
+    block = max(1, round(settings.target_block_m / grid.voxel_size))
+    key = np.ravel_multi_index(tuple((ijk // block).T), tuple(n // block + 1 for n in grid.shape))
+    order = np.lexsort((ids, -worth[ids], key))
+    return ijk[order[np.unique(key[order], return_index=True)[1]]]
 
 
 def _targets(field: RewardField, settings: PlanningSettings) -> tuple[np.ndarray, np.ndarray]:
