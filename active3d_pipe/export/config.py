@@ -34,7 +34,7 @@ class MeshSettings(Settings):
         0.08, ge=0, description="faces this near to seen ones are kept although no frame saw them, m"
     )
     dispute_m: float = Field(
-        0.008, ge=0,
+        0.004, ge=0,
         description="mean SDF at depth readings from which fused readings replace the field there, m; 0: never",
     )
     fusion_truncation_cells: float = Field(

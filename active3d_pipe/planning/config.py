@@ -56,7 +56,7 @@ class PlanningSettings(Settings):
         1.25, ge=1, description="factor on the utility of going on to the goal of the decision before"
     )
     stop_reward: float = Field(
-        1.0, ge=0, description="stop when no reachable view has a higher expected reward; 1 = what discovering two "
+        2.0, ge=0, description="stop when no reachable view has a higher expected reward; 1 = what discovering two "
         "voxels brings, the tolerance of the stop rule"
     )
     stop_search: int = Field(
