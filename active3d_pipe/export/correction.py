@@ -15,6 +15,7 @@ STRIDE = 4  # of the pixels, every how many are compared with the field
 MOST_FRAMES = 200  # evenly spread, that are compared with the field
 MOST_FUSED = 128  # frames that are fused: those with the most readings that contradict
 LEAST_READINGS = 3  # in a cell, for their mean to count
+SURE = 3.0  # standard errors that it must lie off the surface
 MOST_READINGS = 16  # in a cell, after which further frames are not asked about it
 
 
@@ -29,7 +30,7 @@ def corrected_sdf(
         low, high: (3,) corners of the box, world, m.
         frames: logged frames with depth.
         settings: `dispute_m`, the mean SDF at the readings of a cell of two marching-cubes cells from which they are
-            believed, not the field; 0 = never.
+            believed, not the field, if it is more than chance; 0 = never.
 
     The SDF at a reading should be zero, noise aside, which the mean over the cell takes out. Where a sheet is thinner
     than the field resolves, it stays positive on both sides and the surface is lost.
@@ -74,7 +75,8 @@ def _disputed(
     """Grid, the cells (X, Y, Z) bool in and beside which readings contradict, and the frames that do so most."""
     grid = VoxelGrid.from_bounds(low, high, 2 * settings.voxel_size_m)
     origin, inv_cell = grid.origin.astype(np.float32), np.float32(1 / grid.voxel_size)
-    sums, counts = np.zeros(grid.shape, np.float32), np.zeros(grid.shape, np.int32)
+    sums, squares = np.zeros(grid.shape, np.float32), np.zeros(grid.shape, np.float32)
+    counts = np.zeros(grid.shape, np.int32)
     compared = spread(frames, MOST_FRAMES)
     against = np.zeros(len(compared), np.int64)
     for index in _scattered(len(compared)):
@@ -86,10 +88,15 @@ def _disputed(
         )]
         if len(points):
             values = query_sdf(points)
-            kernels.add_readings(points, values, origin, inv_cell, sums, counts)
+            kernels.add_readings(points, values, origin, inv_cell, sums, squares, counts)
             against[index] = (np.abs(values) > settings.dispute_m).sum()
-    mean = np.abs(sums) / np.maximum(counts, 1)
-    marks = (counts >= LEAST_READINGS) & (mean > settings.dispute_m)
+    marks = np.zeros(grid.shape, bool)
+    cells = np.nonzero(counts >= LEAST_READINGS)
+    n = counts[cells]
+    mean = sums[cells] / n
+    # Its standard error: a sensor's noise alone must not outvote the field.
+    error = np.sqrt(np.maximum(squares[cells] / n - mean**2, 0) / (n - 1))
+    marks[cells] = np.abs(mean) > np.maximum(settings.dispute_m, SURE * error)
     order = np.argsort(-against, kind="stable")[:MOST_FUSED]
     return grid, dilated(marks, 1), [compared[int(i)] for i in np.sort(order)]
 

@@ -34,8 +34,9 @@ def open_readings(rotation, centre, lens, depth, stride, reach, origin, inv_cell
 
 
 @njit(cache=True)
-def add_readings(points, values, origin, inv_cell, sums, counts):
-    """Add values (N,) f32 and 1 to the cells of sums (X, Y, Z) f32 and counts i32 that points (N, 3) lie in."""
+def add_readings(points, values, origin, inv_cell, sums, squares, counts):
+    """Add values (N,) f32, their squares and 1 to the cells of sums (X, Y, Z), squares f32 and counts i32 that points
+    (N, 3) lie in."""
     nx, ny, nz = counts.shape
     for n in range(points.shape[0]):
         x = np.int64(np.floor((points[n, 0] - origin[0]) * inv_cell))
@@ -43,6 +44,7 @@ def add_readings(points, values, origin, inv_cell, sums, counts):
         z = np.int64(np.floor((points[n, 2] - origin[2]) * inv_cell))
         if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
             sums[x, y, z] += values[n]
+            squares[x, y, z] += values[n] * values[n]
             counts[x, y, z] += 1
 
 
