@@ -100,3 +100,29 @@ def test_projective_sdf_against_a_slow_reference():
     both = ~np.isnan(got) & ~np.isnan(expected)
     assert np.quantile(np.abs(got[both] - expected[both]), 0.98) < 1e-5
     assert both.sum() > 50
+
+
+def test_readings_of_full_cells_are_left_out():
+    frame = both_sides()[0]
+    c, T = frame.camera, frame.T_world_camera.astype(np.float32)
+    pose = (np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3]), np.array([c.fx, c.fy, c.cx, c.cy], "f4"))
+    origin, inv_cell = LOW.astype(np.float32), np.float32(1 / 0.08)
+    counts = np.zeros(tuple(np.ceil((HIGH - LOW) / 0.08).astype(int)), np.int32)
+    points = np.empty((frame.depth.size, 3), np.float32)
+
+    def readings():
+        reach = np.array([c.near, c.far], np.float32)
+        n = kernels.open_readings(*pose, frame.depth, 2, reach, origin, inv_cell, counts, 5, points)
+        return points[:n].copy()
+
+    first = readings()
+    valid = (frame.depth > c.near) & (frame.depth < c.far)
+    whole = projection.unproject(frame.depth, frame.T_world_camera, c)[1::2, 1::2][valid[1::2, 1::2]]
+    inside = ((whole >= LOW) & (whole < LOW + np.array(counts.shape) * 0.08)).all(axis=1)
+    assert len(first) == inside.sum() > 50
+    assert np.abs(first - whole[inside]).max() < 1e-4
+    sums, squares = np.zeros(counts.shape, np.float32), np.zeros(counts.shape, np.float32)
+    kernels.add_readings(first, np.full(len(first), 0.5, np.float32), origin, inv_cell, sums, squares, counts)
+    assert counts.sum() == len(first) and np.allclose(sums, 0.5 * counts) and np.allclose(squares, 0.25 * counts)
+    cells = tuple(np.floor((first - origin) * inv_cell).astype(int).T)
+    assert len(readings()) == (counts[cells] < 5).sum()

@@ -4,11 +4,12 @@ import pytest
 
 from active3d_pipe.geometry import se3
 from active3d_pipe.planning import kernels_targets
+from active3d_pipe.planning.choice import score
 from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.free_space import build_free_space
 from active3d_pipe.planning.reference_reward import cell_bit
 from active3d_pipe.planning.reward import build_reward_field
-from active3d_pipe.planning.targets import target_positions
+from active3d_pipe.planning.targets import hidden_positions, target_positions
 from active3d_pipe.structures.motion import MotionSettings
 
 SETTINGS, MOTION = PlanningSettings(), MotionSettings()
@@ -90,3 +91,29 @@ def test_positions_that_see_what_is_left_are_found():
     assert ((np.abs(found[:, 1] - 1.15) < 0.25) & (found[:, 0] > 0.8)).any()
     none = PlanningSettings(max_targets=0)
     assert len(target_positions(space, field, MOTION, none)) == 0
+
+
+def test_what_only_a_look_from_above_shows_is_found():
+    """A shaft behind a sideboard: its rim is seen from everywhere, its depth from over it only."""
+    world = box_world.build((3.0, 2.4, 2.6), [((0.4, 0.35, 0.0), (2.6, 0.6, 1.2))])
+    start = np.array([1.5, 1.6, 1.0])
+    poses = np.array([se3.pose_from_yaw_pitch(start, a, p) for a in np.arange(0, 6.28, 0.5) for p in (-0.5, 0.5)])
+    for T in poses:
+        world.capture(T)
+    volume = world.volume()
+    field = build_reward_field(volume, poses, world.camera, SETTINGS)
+    space = build_free_space(volume, poses[-1], poses[:, :3, 3], MOTION, SETTINGS)
+    found = {turn: hidden_positions(space, field, MOTION, SETTINGS, 10**9, turn) for turn in (0, 1)}
+    for turn, voxels in found.items():
+        assert len(voxels) > 10 and space.reachable[tuple(voxels.T)].all()
+        assert ((voxels - space.start) % 2 == turn).all()
+    above = space.grid.centre_of(np.concatenate(list(found.values())))
+    assert ((above[:, 1] < 0.8) & (above[:, 2] > 1.5)).any()
+    few = hidden_positions(space, field, MOTION, SETTINGS, 2000, 0)
+    assert 0 < len(few) < len(found[0])
+    pools = [
+        score(space, field, poses[-1], world.camera, MOTION, SETTINGS, None, hidden_pairs=10**9, turns=turns)
+        for turns in ((), (0, 1))
+    ]
+    quick, thorough = (max(t.reward for t in pool.terms) for pool in pools)
+    assert thorough >= 0.9 * quick > SETTINGS.stop_reward
