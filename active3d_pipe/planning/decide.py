@@ -44,7 +44,7 @@ class _Task:
 
 
 # Times the pairs of the quick search for hidden space in the thorough one.
-THOROUGH_PAIRS = 50
+THOROUGH_PAIRS = 20
 # Views that are appended to a short path at most.
 LONGEST_CHAIN = 4
 
