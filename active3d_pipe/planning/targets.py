@@ -8,6 +8,7 @@ from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.free_space import FreeSpace
 from active3d_pipe.planning.reward import RewardField
 from active3d_pipe.structures.motion import MotionSettings
+from active3d_pipe.structures.voxel_grid import VoxelGrid
 
 BIT_COUNT = np.array([bin(n).count("1") for n in range(256)], np.float32)
 
@@ -66,12 +67,23 @@ def _unseen_blocks(field: RewardField, settings: PlanningSettings) -> np.ndarray
     """(T, 3) int64: of every block the open voxel with the most value."""
     grid = field.grid
     worth = np.where(field.kind == OPEN, field.value, 0)
+    first, _ = _best_of_each_block(worth, grid, settings)
+    return np.stack(np.unravel_index(first, grid.shape), axis=-1)
+
+
+def _best_of_each_block(
+    worth: np.ndarray, grid: VoxelGrid, settings: PlanningSettings
+) -> tuple[np.ndarray, np.ndarray]:
+    """Flat voxels (B,) of the most worth in each block that has any, ties to the first, and the blocks' sums."""
     ids = np.flatnonzero(worth > 0)
     ijk = np.stack(np.unravel_index(ids, grid.shape), axis=-1)
     block = max(1, round(settings.target_block_m / grid.voxel_size))
-    key = np.ravel_multi_index(tuple((ijk // block).T), tuple(n // block + 1 for n in grid.shape))
+    shape = tuple(n // block + 1 for n in grid.shape)
+    key = np.ravel_multi_index(tuple((ijk // block).T), shape)
+    total = np.bincount(key, weights=worth[ids], minlength=int(np.prod(shape)))
     order = np.lexsort((ids, -worth[ids], key))
-    return ijk[order[np.unique(key[order], return_index=True)[1]]]
+    first = order[np.unique(key[order], return_index=True)[1]]
+    return ids[first], total[key[first]]
 
 
 def _targets(field: RewardField, settings: PlanningSettings) -> tuple[np.ndarray, np.ndarray]:
@@ -92,14 +104,6 @@ def _targets(field: RewardField, settings: PlanningSettings) -> tuple[np.ndarray
     in_cells = BIT_COUNT[field.open_bits] * field.cell_value
     first_open = np.where(in_cells > worth, field.open_bits & (~field.open_bits + np.uint8(1)), 0).astype(np.uint8)
     worth = worth + in_cells
-    ids = np.flatnonzero(worth > 0)
-    ijk = np.stack(np.unravel_index(ids, grid.shape), axis=-1)
-    block = max(1, round(settings.target_block_m / grid.voxel_size))
-    shape = tuple(n // block + 1 for n in grid.shape)
-    key = np.ravel_multi_index(tuple((ijk // block).T), shape)
-    total = np.bincount(key, weights=worth[ids], minlength=int(np.prod(shape)))
-    order = np.lexsort((ids, -worth[ids], key))
-    first = order[np.unique(key[order], return_index=True)[1]]
-    best = np.argsort(-total[key[first]], kind="stable")[: settings.max_targets]
-    chosen = first[best]
-    return ijk[chosen], first_open[ids[chosen]]
+    first, total = _best_of_each_block(worth, grid, settings)
+    chosen = first[np.argsort(-total, kind="stable")[: settings.max_targets]]
+    return np.stack(np.unravel_index(chosen, grid.shape), axis=-1), first_open[chosen]

@@ -74,18 +74,24 @@ def test_best_viewpoints_equal_the_reference():
                 assert values[chosen] == pytest.approx(values.max(), rel=1e-4)
 
 
-def test_positions_that_see_what_is_left_are_found():
-    """A niche that can be looked into from in front only: a lattice may miss it, the search from the niche does not."""
-    niche = [((2.0, 0.0, 0.0), (2.2, 1.0, 2.0)), ((2.0, 1.3, 0.0), (2.2, 2.2, 2.0)), ((2.2, 0.0, 0.0), (3.4, 0.9, 2.0)),
-             ((2.2, 1.4, 0.0), (3.4, 2.2, 2.0))]  # fmt: skip
-    world = box_world.build((3.4, 2.2, 2.0), niche)
-    start = np.array([0.6, 0.5, 1.0])
+def looked_around(world, start):
+    """Free space, reward field and last pose of an agent that turned on the spot, looking up and down."""
+    start = np.array(start)
     poses = np.array([se3.pose_from_yaw_pitch(start, a, p) for a in np.arange(0, 6.28, 0.5) for p in (-0.5, 0.5)])
     for T in poses:
         world.capture(T)
     volume = world.volume()
     field = build_reward_field(volume, poses, world.camera, SETTINGS)
     space = build_free_space(volume, poses[-1], poses[:, :3, 3], MOTION, SETTINGS)
+    return space, field, poses[-1]
+
+
+def test_positions_that_see_what_is_left_are_found():
+    """A niche that can be looked into from in front only: a lattice may miss it, the search from the niche does not."""
+    niche = [((2.0, 0.0, 0.0), (2.2, 1.0, 2.0)), ((2.0, 1.3, 0.0), (2.2, 2.2, 2.0)), ((2.2, 0.0, 0.0), (3.4, 0.9, 2.0)),
+             ((2.2, 1.4, 0.0), (3.4, 2.2, 2.0))]  # fmt: skip
+    world = box_world.build((3.4, 2.2, 2.0), niche)
+    space, field, _ = looked_around(world, (0.6, 0.5, 1.0))
     found = space.grid.centre_of(target_positions(space, field, MOTION, SETTINGS))
     assert space.reachable[tuple(space.grid.index_of(found).T)].all()
     assert ((np.abs(found[:, 1] - 1.15) < 0.25) & (found[:, 0] > 0.8)).any()
@@ -96,13 +102,7 @@ def test_positions_that_see_what_is_left_are_found():
 def test_what_only_a_look_from_above_shows_is_found():
     """A shaft behind a sideboard: its rim is seen from everywhere, its depth from over it only."""
     world = box_world.build((3.0, 2.4, 2.6), [((0.4, 0.35, 0.0), (2.6, 0.6, 1.2))])
-    start = np.array([1.5, 1.6, 1.0])
-    poses = np.array([se3.pose_from_yaw_pitch(start, a, p) for a in np.arange(0, 6.28, 0.5) for p in (-0.5, 0.5)])
-    for T in poses:
-        world.capture(T)
-    volume = world.volume()
-    field = build_reward_field(volume, poses, world.camera, SETTINGS)
-    space = build_free_space(volume, poses[-1], poses[:, :3, 3], MOTION, SETTINGS)
+    space, field, T = looked_around(world, (1.5, 1.6, 1.0))
     found = {turn: hidden_positions(space, field, MOTION, SETTINGS, 10**9, turn) for turn in (0, 1)}
     for turn, voxels in found.items():
         assert len(voxels) > 10 and space.reachable[tuple(voxels.T)].all()
@@ -112,7 +112,7 @@ def test_what_only_a_look_from_above_shows_is_found():
     few = hidden_positions(space, field, MOTION, SETTINGS, 2000, 0)
     assert 0 < len(few) < len(found[0])
     pools = [
-        score(space, field, poses[-1], world.camera, MOTION, SETTINGS, None, hidden_pairs=10**9, turns=turns)
+        score(space, field, T, world.camera, MOTION, SETTINGS, None, hidden_pairs=10**9, turns=turns)
         for turns in ((), (0, 1))
     ]
     quick, thorough = (max(t.reward for t in pool.terms) for pool in pools)
