@@ -69,7 +69,7 @@ class PlanningSettings(Settings):
     )
     hidden_pairs: int = Field(
         10_000_000, ge=1, description="pairs of a place and a block of unseen space that one such search tries; before "
-        "the stop twenty times as many"
+        "the stop many times as many (THOROUGH_PAIRS in planning/decide.py)"
     )
     max_steps_per_round: int = Field(30, ge=1, description="steps of one decision at most; longer paths are cut")
     min_steps_per_round: int = Field(
