@@ -34,9 +34,9 @@ from active3d_pipe.structures import TriangleMesh
 from stages import shared
 
 
-def settings_of(pairs: list[str]) -> MappingSettings:
-    """Mapping settings with the given `a.b=value` changes, or those of a file."""
-    document: dict[str, Any] = {}
+def settings_of(pairs: list[str], base: dict[str, Any] | None = None) -> MappingSettings:
+    """Mapping settings with the given `a.b=value` changes to `base` (the defaults), or those of a file."""
+    document: dict[str, Any] = base or {}
     for pair in pairs:
         if pair.endswith(".toml"):
             document |= read_toml(Path(pair)).get("mapping", {})

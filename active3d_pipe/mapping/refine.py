@@ -6,6 +6,7 @@ import numpy as np
 
 from active3d_pipe.errors import NumericalError
 from active3d_pipe.mapping import branches
+from active3d_pipe.mapping.frame_order import rarity, visiting_order
 from active3d_pipe.mapping.hybrid_map import HybridMap
 from active3d_pipe.mapping.update import UpdateReport, round_number
 from active3d_pipe.structures import Frame
@@ -26,9 +27,10 @@ def refine(
 ) -> UpdateReport:
     """Optimise both branches over all captured `frames` (not only keyframes), in place.
 
-    Frames are visited in random order, each once before any twice. Held-out views are never seen here.
+    Frames that show what few others show are visited more often (`frame_order`). Held-out views are never seen here.
     """
     settings, clock = hybrid.settings, branches.Clock()
+    weights = rarity(frames) ** settings.refinement_balance
     for i in range(settings.refinement_field_iterations if settings.geometry == "neural" else 0):
         rate = annealed(i, settings.refinement_field_iterations)
         branches.train_field(hybrid, frames, None, rng, clock, rate)
@@ -39,12 +41,9 @@ def refine(
     growth = limit - len(hybrid.gaussians)
     quota = max(1, int(growth / max(total * ADD_UNTIL / ADD_EVERY, 1))) if growth > 0 else 0
     coupled = settings.representation == "hybrid"
-    order: list[int] = []
     scores: list[float] = []
-    for i in range(total):
-        if not order:
-            order = [int(j) for j in rng.permutation(len(frames))]
-        frame = frames[order.pop()]
+    for i, visited in enumerate(visiting_order(weights, total, rng)):
+        frame = frames[visited]
         if i % ADD_EVERY == 0 and i < total * ADD_UNTIL:
             added += branches.add_where_wrong(hybrid, frame, quota, limit, rng, clock)
         pull = None
