@@ -12,16 +12,15 @@ import time
 from pathlib import Path
 
 import numpy as np
-from mapping import geometry, settings_of
+from mapping import geometry, quality, settings_of
 from run_folder import FinishedRun
 
-from active3d_pipe.evaluation.geometry_metrics import prepare_truth
 from active3d_pipe.evaluation.image_metrics import psnr, ssim
 from active3d_pipe.geometry.sampling import spread
 from active3d_pipe.mapping.branches import unit_rgb
 from active3d_pipe.mapping.hybrid_map import HybridMap
 from active3d_pipe.mapping.refine import refine
-from active3d_pipe.structures import Frame, TriangleMesh
+from active3d_pipe.structures import Frame
 from stages import shared
 from stages.export import MAX_FRAMES
 
@@ -54,9 +53,7 @@ def main() -> None:
     frames = shared.load_spread(run.inputs, run.last_round, MAX_FRAMES)
     truth, head = None, ""
     if given.mesh:
-        scene = run.simulator.scene
-        whole = TriangleMesh(scene.vertices.astype(np.float32), scene.faces.astype(np.int32))
-        truth = prepare_truth(whole, run.config.evaluation, run.observable)
+        truth = run.truth()
         head = " accuracy cm | completion cm | C.R. % | MAD cm |"
     print(f"{given.run}: {len(frames)} frames, {len(views)} held-out views, {given.iterations} iterations\n")
     head = f"| variant | dB | 10th perc. | SSIM | depth cm | median | > 5 cm % | captured dB | Gaussians | s |{head}"
@@ -68,9 +65,7 @@ def main() -> None:
         start = time.perf_counter()
         refine(hybrid, frames, np.random.default_rng(given.seed), lambda _: None)
         took = time.perf_counter() - start
-        captured = np.mean([
-            psnr(np.clip(hybrid.render(f.camera, f.T_world_camera).rgb, 0, 1), unit_rgb(f)) for f in spread(frames, 50)
-        ])
+        captured, _ = quality(hybrid, spread(frames, 50))
         cells = [name, *judged(hybrid, views), f"{captured:.2f}", str(len(hybrid.gaussians)), f"{took:.0f}"]
         if truth:
             cells.append(geometry(hybrid, frames, config, truth))

@@ -13,6 +13,7 @@ from active3d_pipe.storage import meshes
 from stages import shared
 
 if TYPE_CHECKING:
+    from active3d_pipe.evaluation.geometry_metrics import TruthSurface
     from active3d_pipe.mapping.hybrid_map import HybridMap
     from active3d_pipe.sim.simulator import Simulator
     from active3d_pipe.structures import Frame, TriangleMesh
@@ -61,6 +62,15 @@ class FinishedRun:
             self.simulator, settings.num_views, scene.name, min_clearance_m=settings.view_clearance_m
         )
         return [self.simulator.render(T, step=i) for i, T in enumerate(poses)]
+
+    def truth(self, *, floors: bool = True) -> "TruthSurface":
+        """The true surface, prepared as the evaluation does."""
+        from active3d_pipe.evaluation.geometry_metrics import prepare_truth
+        from active3d_pipe.structures import TriangleMesh
+
+        scene = self.simulator.scene
+        whole = TriangleMesh(scene.vertices.astype(np.float32), scene.faces.astype(np.int32))
+        return prepare_truth(whole, self.config.evaluation, self.observable, floors=floors)
 
     def observable(self, points: np.ndarray) -> np.ndarray:
         """(N,) bool, whether a reachable pose can see each point; the same draw as in the evaluation."""

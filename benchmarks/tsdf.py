@@ -17,7 +17,6 @@ from run_folder import FinishedRun
 from active3d_pipe.evaluation import image_metrics
 from active3d_pipe.evaluation.culling import SeenBy
 from active3d_pipe.evaluation.evaluate import evaluate_geometry
-from active3d_pipe.evaluation.geometry_metrics import prepare_truth
 from active3d_pipe.geometry.raycasting import import_open3d
 from active3d_pipe.structures import Frame, TriangleMesh
 
@@ -97,9 +96,7 @@ def compare(run: FinishedRun, reextract: bool, png: Path | None) -> list[list[st
         meshes["ours"] = mesh, {"mesh": seconds}
     else:
         meshes["ours, as exported"] = run.mesh, {}
-    scene = run.simulator.scene
-    whole = TriangleMesh(scene.vertices.astype(np.float32), scene.faces.astype(np.int32))
-    truth = prepare_truth(whole, settings, run.observable, floors=False)
+    truth = run.truth(floors=False)
     seen_by = SeenBy(frames[0].camera, np.stack([f.T_world_camera for f in frames]), [f.depth for f in frames])
     views = run.held_out()
     splats = np.mean(view_psnr(gaussian_render(run), views))

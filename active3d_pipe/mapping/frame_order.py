@@ -9,7 +9,7 @@ from active3d_pipe.structures import Frame
 
 READING_STRIDE = 8  # px between the readings that say what a frame shows
 CELL_M = 0.05  # readings in the same cell of this edge show the same surface
-LEAST, MOST = 0.2, 8.0  # no frame is visited less or more often than this, times the mean
+LEAST, MOST = 0.2, 8.0  # bounds of the weights, which are 1 or so on the mean: no frame is forgotten, none dominates
 
 
 def rarity(frames: Sequence[Frame]) -> np.ndarray:
@@ -30,7 +30,7 @@ def rarity(frames: Sequence[Frame]) -> np.ndarray:
 
 
 def visiting_order(weights: np.ndarray, visits: int, rng: np.random.Generator) -> np.ndarray:
-    """(visits,) indices of the frames to visit, each as often as its weight says (F,), to within one, evenly spread.
+    """(visits,) indices of the frames to visit, each about as often as its weight (F,) says, evenly spread.
 
     Frame f is due at the times (k + u_f) / p_f with a random phase u_f and its share p_f of the visits: where weights
     are equal, a random order that comes back.

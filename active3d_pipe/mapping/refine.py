@@ -30,7 +30,6 @@ def refine(
     Frames that show what few others show are visited more often (`frame_order`). Held-out views are never seen here.
     """
     settings, clock = hybrid.settings, branches.Clock()
-    weights = rarity(frames) ** settings.refinement_balance
     for i in range(settings.refinement_field_iterations if settings.geometry == "neural" else 0):
         rate = annealed(i, settings.refinement_field_iterations)
         branches.train_field(hybrid, frames, None, rng, clock, rate)
@@ -42,7 +41,8 @@ def refine(
     quota = max(1, int(growth / max(total * ADD_UNTIL / ADD_EVERY, 1))) if growth > 0 else 0
     coupled = settings.representation == "hybrid"
     scores: list[float] = []
-    for i, visited in enumerate(visiting_order(weights, total, rng)):
+    order = visiting_order(rarity(frames) ** settings.refinement_balance, total, rng) if total else ()
+    for i, visited in enumerate(order):
         frame = frames[visited]
         if i % ADD_EVERY == 0 and i < total * ADD_UNTIL:
             added += branches.add_where_wrong(hybrid, frame, quota, limit, rng, clock)
