@@ -167,3 +167,16 @@ def first_hits(opaque, origin, directions, t_end, shape, out_t):
             origin[0] - np.float32(i), origin[1] - np.float32(j), origin[2] - np.float32(k), dx, dy, dz, 1, 1, 1
         )
         out_t[r] = max(t, np.float32(1e-6))
+
+
+@njit(fastmath=True, cache=True)
+def first_voxels(opaque, origin, directions, t_end, shape, out_id):
+    """Flat id of the first opaque voxel on each ray, -1 when it meets none before t_end."""
+    nx, ny, nz = shape
+    ids = np.empty(nx + ny + nz + 3, np.int32)
+    for r in range(directions.shape[0]):
+        n = walk_ray(
+            opaque, origin[0], origin[1], origin[2], directions[r, 0], directions[r, 1], directions[r, 2],
+            t_end, nx, ny, nz, ids,
+        )
+        out_id[r] = ids[n - 1] if n > 0 and opaque[ids[n - 1]] != 0 else -1

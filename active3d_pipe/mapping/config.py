@@ -74,7 +74,7 @@ class MappingSettings(Settings):
     learning_rate_scale: float = Field(0.4, gt=0, description="scale on the Gaussians' learning rates while exploring")
     refinement_iterations: int = Field(3000, ge=0, description="annealed iterations over all logged frames, in export")
     refinement_balance: float = Field(
-        0.5, ge=0, description="visits of the refinement to a frame go with this power of the rarity of what it shows"
+        0.5, ge=0, description="visits of the refinement to a frame go with this power of its exposure (frame_order)"
     )
     refinement_field_iterations: int = Field(400, ge=0, description="annealed field iterations, in export")
     field: FieldSettings = Field(default_factory=FieldSettings, description="implicit branch")

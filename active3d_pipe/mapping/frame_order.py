@@ -1,32 +1,50 @@
-"""In which order the refinement visits frames: what few of them show must not be what is learnt least."""
+"""In which order the refinement visits frames: what is seen from many places must not be what is learnt least."""
 
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 
+from active3d_pipe.geometry import kernels_traversal as kernels
+from active3d_pipe.geometry.voxel_traversal import carve, ray_fan, to_voxel_units
 from active3d_pipe.mapping.keyframes import depth_samples
-from active3d_pipe.structures import Frame
+from active3d_pipe.structures import Frame, VoxelGrid
 
-READING_STRIDE = 8  # px between the readings that say what a frame shows
-CELL_M = 0.05  # readings in the same cell of this edge show the same surface
+READING_STRIDE = 8  # px between the rays that say what a frame shows
+CELL_M = 0.1  # rays that end in the same cell of this edge show the same surface ...
+MOST_CELLS = 8_000_000  # ... or of a larger one, where the scene has more of them
+CLEARANCE_M = 0.25  # of the places from which anyone may look, to what is not known to be free
+PLACES, GLANCES = 1000, 200  # random views: so many places, so many directions from each
 LEAST, MOST = 0.2, 8.0  # bounds of the weights, which are 1 or so on the mean: no frame is forgotten, none dominates
 
 
-def rarity(frames: Sequence[Frame]) -> np.ndarray:
-    """How rare it is what each frame shows: (F,) float64, 1 on the mean.
+def exposure(frames: Sequence[Frame], rng: np.random.Generator) -> np.ndarray:
+    """How much more of what a frame shows is to be seen from anywhere than `frames` show of it: (F,), 1 on the mean.
 
-    The mean over a frame's depth readings of 1 / (frames that have a reading in the same cell of `CELL_M`). Visits in
-    proportion to it give every cell about as many, where visiting all frames alike gives most to what most of them
-    show: the middle of the scene, and places where the walk lingered. A frame without a reading counts as the mean.
+    For every cell of surface, the rays of random views from the free space that end in it over the rays of the frames
+    that do; for a frame, the mean of that over its rays. Visits in proportion to it learn the surface in the
+    proportions in which it will be looked at, where visiting all frames alike learns it in those of the walk, which
+    lingered here and passed there. All 1 when there is no free space to look from.
     """
-    cells = [_cells(frame) for frame in frames]
-    seen_in = [np.unique(c) for c in cells]
-    if not any(len(c) for c in cells):
+    grid = _grid_around(frames)
+    if grid is None:
         return np.ones(len(frames))
-    known, frames_of = np.unique(np.concatenate(seen_in), return_counts=True)
-    rare = np.array([np.mean(1 / frames_of[np.searchsorted(known, c)]) if len(c) else np.nan for c in cells])
-    rare = np.where(np.isnan(rare), np.nanmean(rare), rare)
-    return rare / rare.mean()
+    free, hit = (np.zeros(grid.shape, np.int32) for _ in range(2))
+    for frame in frames:
+        carve(grid, frame.T_world_camera, frame.camera, frame.depth, ray_stride=READING_STRIDE, counts=(free, hit))
+    opaque = ((free == 0) | (hit > 0)).view(np.uint8).ravel()  # a look ends at what is not known
+    shown = [_ends(grid, opaque, f.T_world_camera, ray_fan(f.camera, READING_STRIDE)[2], f.camera.far) for f in frames]
+    shown = [ends[hit.ravel()[ends] > 0] for ends in shown]
+    by_frames = np.bincount(np.concatenate(shown), minlength=grid.size)
+    by_looks = np.bincount(_random_looks(grid, opaque, rng), minlength=grid.size) * (by_frames > 0)
+    if not by_looks.any():
+        return np.ones(len(frames))
+    # One look more in every cell, of either kind: few looks say little.
+    looks_per_ray = by_looks.sum() / by_frames.sum()
+    ratio = (by_looks + 1) / (by_frames * looks_per_ray + 1)
+    weights = np.array([ratio[ends].mean() if len(ends) else np.nan for ends in shown])
+    weights = np.where(np.isnan(weights), np.nanmean(weights), weights)
+    return weights / weights.mean()
 
 
 def visiting_order(weights: np.ndarray, visits: int, rng: np.random.Generator) -> np.ndarray:
@@ -44,7 +62,38 @@ def visiting_order(weights: np.ndarray, visits: int, rng: np.random.Generator) -
     return frame[np.argsort(due, kind="stable")][:visits]
 
 
-def _cells(frame: Frame) -> np.ndarray:
-    """(N,) int64 names of the cells in which the frame's sparse readings lie."""
-    x, y, z = np.floor(depth_samples(frame, READING_STRIDE) / CELL_M).astype(np.int64).T
-    return (x << 42) + (y << 21) + z  # 21 bits an axis: 52 km either way
+def _grid_around(frames: Sequence[Frame]) -> VoxelGrid | None:
+    """The cells of everything that the frames read, and of their cameras; None without a reading."""
+    points = [depth_samples(frame, READING_STRIDE) for frame in frames]
+    if not any(len(p) for p in points):
+        return None
+    points += [frame.T_world_camera[None, :3, 3] for frame in frames]
+    low, high = np.min([p.min(0) for p in points if len(p)], 0), np.max([p.max(0) for p in points if len(p)], 0)
+    edge = max(CELL_M, float(np.prod(high - low + CELL_M) / MOST_CELLS) ** (1 / 3))
+    return VoxelGrid.from_bounds(low - edge / 2, high + edge / 2, edge)
+
+
+def _random_looks(grid: VoxelGrid, opaque: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """(N,) cells in which rays of random directions from random places of the free space end."""
+    distance = distance_transform_edt(opaque.reshape(grid.shape) == 0, sampling=grid.voxel_size)
+    places = np.argwhere(distance >= CLEARANCE_M)
+    if not len(places):
+        return np.zeros(0, np.int64)
+    longest, ends = float(np.linalg.norm(grid.high - grid.low)), []
+    for place in places[rng.integers(0, len(places), PLACES)]:
+        T = np.eye(4)
+        T[:3, 3] = grid.centre_of(place)
+        directions = rng.normal(size=(GLANCES, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        ends.append(_ends(grid, opaque, T, directions, longest))
+    return np.concatenate(ends)
+
+
+def _ends(
+    grid: VoxelGrid, opaque: np.ndarray, T_world_camera: np.ndarray, directions: np.ndarray, reach_m: float
+) -> np.ndarray:
+    """(N,) flat ids of the cells in which rays end, of those (M, 3) in the camera frame that end in one."""
+    origin, rays = to_voxel_units(grid, T_world_camera, directions)
+    ids = np.zeros(len(rays), np.int64)
+    kernels.first_voxels(opaque, origin, rays, np.float32(reach_m), grid.shape, ids)
+    return ids[ids >= 0]

@@ -6,7 +6,7 @@ import numpy as np
 
 from active3d_pipe.errors import NumericalError
 from active3d_pipe.mapping import branches
-from active3d_pipe.mapping.frame_order import rarity, visiting_order
+from active3d_pipe.mapping.frame_order import exposure, visiting_order
 from active3d_pipe.mapping.hybrid_map import HybridMap
 from active3d_pipe.mapping.update import UpdateReport, round_number
 from active3d_pipe.structures import Frame
@@ -27,7 +27,7 @@ def refine(
 ) -> UpdateReport:
     """Optimise both branches over all captured `frames` (not only keyframes), in place.
 
-    Frames that show what few others show are visited more often (`frame_order`). Held-out views are never seen here.
+    Frames are visited by how much is to be seen of what they show (`frame_order`). Held-out views are never seen here.
     """
     settings, clock = hybrid.settings, branches.Clock()
     for i in range(settings.refinement_field_iterations if settings.geometry == "neural" else 0):
@@ -41,7 +41,7 @@ def refine(
     quota = max(1, int(growth / max(total * ADD_UNTIL / ADD_EVERY, 1))) if growth > 0 else 0
     coupled = settings.representation == "hybrid"
     scores: list[float] = []
-    order = visiting_order(rarity(frames) ** settings.refinement_balance, total, rng) if total else ()
+    order = visiting_order(exposure(frames, rng) ** settings.refinement_balance, total, rng) if total else ()
     for i, visited in enumerate(order):
         frame = frames[visited]
         if i % ADD_EVERY == 0 and i < total * ADD_UNTIL:

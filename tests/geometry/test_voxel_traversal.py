@@ -83,6 +83,24 @@ def test_stops_at_the_first_opaque_voxel_and_includes_it():
     assert walk(opaque, (0.5, 2.5, 2.5), (1, 0, 0), 100)[-1] == (4, 2, 2)
 
 
+def test_first_voxels_are_where_the_reference_stops():
+    rng = np.random.default_rng(3)
+    opaque = rng.random(SHAPE) < 0.1
+    origin = np.array([3.3, 2.6, 2.2])
+    opaque[3, 2, 2] = False
+    directions = rng.normal(size=(200, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    found = np.zeros(len(directions), np.int64)
+    kernels.first_voxels(
+        opaque.view(np.uint8).ravel(), origin.astype(np.float32), directions.astype(np.float32), np.float32(3.0), SHAPE,
+        found,
+    )
+    paths = [reference.traverse(opaque, origin, d, 3.0) for d in directions]
+    wanted = [np.ravel_multi_index(path[-1], SHAPE) if opaque[path[-1]] else -1 for path in paths]
+    assert np.count_nonzero(found != wanted) <= 2  # rays through an edge may pass on either side
+    assert 20 < np.count_nonzero(found < 0) < 180
+
+
 def test_ray_that_misses_the_grid_sees_nothing():
     assert walk(np.zeros(SHAPE, bool), (-2, -2, -2), (-1, 0, 0), 100) == []
 

@@ -1,4 +1,4 @@
-"""The refinement's order of visits: rare surface weighs more, and every frame comes as often as its weight says."""
+"""The refinement's order of visits: what is seen much and shown little weighs more, and weights set how often."""
 
 from dataclasses import replace
 
@@ -7,44 +7,86 @@ import pytest
 from room_with_ball import render
 
 from active3d_pipe.geometry import se3
-from active3d_pipe.mapping.frame_order import LEAST, MOST, rarity, visiting_order
+from active3d_pipe.mapping import frame_order
+from active3d_pipe.mapping.frame_order import LEAST, MOST, exposure, visiting_order
 from active3d_pipe.structures import Camera
 
 CAMERA = Camera.from_fov(96, 64, 80.0)
-EYE = np.array([-0.5, 0.6, 0.9])
+EYE = np.array([0.0, 0.7, 0.8])
 
 
-def view(yaw_deg: float):
-    yaw = np.radians(yaw_deg)
-    return render(CAMERA, se3.look_at(EYE, EYE + np.array([np.cos(yaw), np.sin(yaw), -0.1])), step=0)
+def view(yaw_deg: float, pitch_deg: float = 0.0, eye=EYE):
+    yaw, pitch = np.radians(yaw_deg), np.radians(pitch_deg)
+    ahead = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
+    return render(CAMERA, se3.look_at(eye, eye + ahead), step=0)
 
 
-def test_a_frame_counts_by_how_few_frames_show_what_it_shows() -> None:
-    same, other = view(0), view(180)
-    np.testing.assert_allclose(rarity([same, same, same, other]), [2 / 3, 2 / 3, 2 / 3, 2])
+def all_around():
+    """Views of the whole room, from either side of the ball."""
+    eyes = (EYE, EYE * [1, -1, 1])
+    return [view(yaw, pitch, eye) for eye in eyes for yaw in range(0, 360, 45) for pitch in (-55, 0, 55)]
+
+
+def weights_of(frames, seed: int = 0):
+    return exposure(frames, np.random.default_rng(seed))
+
+
+def test_what_many_frames_show_counts_less() -> None:
+    # Twenty more frames of what the fourth shows.
+    around = all_around()
+    before, after = weights_of(around), weights_of([*around, *[view(45)] * 20])
+    shown_often = around.index(next(f for f in around if np.array_equal(f.T_world_camera, view(45).T_world_camera)))
+    assert (after[len(around) :] == after[shown_often]).all()
+    assert after[shown_often] == after.min()
+    assert after[shown_often] < 0.3 * before[shown_often]
+    assert after[3:].argmax() != shown_often
 
 
 def test_partly_shared_views_lie_between() -> None:
-    weights = rarity([view(0), view(0), view(40), view(180)])
-    assert weights[0] == weights[1] < weights[2] < weights[3]
+    weights = weights_of([*all_around(), *[view(90)] * 20, view(60), view(270)])
+    assert weights[-3] < weights[-2] < weights[-1]
 
 
-def test_frames_without_a_reading_count_as_the_mean() -> None:
+def test_a_close_look_at_little_counts_less_than_a_wide_one() -> None:
+    weights = weights_of([*all_around(), view(180, eye=EYE - [0.8, 0, 0]), view(180)])
+    assert weights[-2] < 0.7 * weights[-1]
+
+
+def test_a_frame_without_depth_shows_what_lies_ahead_of_it() -> None:
+    blind = replace(view(45), depth=np.zeros((64, 96), np.float32))
+    weights = weights_of([*all_around(), view(45), blind])
+    assert weights[-1] == weights[-2]
+
+
+def test_without_any_depth_all_count_alike() -> None:
     blind = replace(view(0), depth=np.zeros((64, 96), np.float32))
-    np.testing.assert_allclose(rarity([view(0), view(180), blind]), 1)
-    np.testing.assert_allclose(rarity([blind, blind]), 1)
+    np.testing.assert_array_equal(weights_of([blind, blind]), 1)
 
 
-def test_rarity_does_not_ask_where_the_origin_is() -> None:
-    # Whole cells away, to both sides of every axis.
-    def moved(frame, by: float):
-        pose = frame.T_world_camera.copy()
-        pose[:3, 3] += by
-        return replace(frame, T_world_camera=pose)
+def test_without_room_to_look_from_all_count_alike() -> None:
+    near = [replace(view(yaw), depth=np.full((64, 96), 0.2, np.float32)) for yaw in (0, 10)]
+    np.testing.assert_array_equal(weights_of(near), 1)
 
-    frames = [view(yaw) for yaw in (0, 20, 40, 180)]
-    expected = rarity([moved(f, 64.0) for f in frames])
-    np.testing.assert_allclose(rarity([moved(f, -64.0) for f in frames]), expected, rtol=0.02)
+
+def test_a_frame_that_shows_nothing_known_counts_as_the_mean() -> None:
+    # Its rays run through the unknown outside the room and meet nothing.
+    outside = replace(view(0, eye=np.array([30.0, 0, 0.8])), depth=np.zeros((64, 96), np.float32))
+    around = all_around()
+    assert weights_of([*around, outside])[-1] == pytest.approx(1)
+
+
+def test_the_same_seed_gives_the_same_and_another_about_the_same() -> None:
+    frames = all_around()
+    np.testing.assert_array_equal(weights_of(frames), weights_of(frames))
+    np.testing.assert_allclose(weights_of(frames, 1), weights_of(frames), rtol=0.25)
+
+
+def test_cells_grow_where_the_scene_is_large(monkeypatch) -> None:
+    frames = all_around()
+    fine = weights_of(frames)
+    monkeypatch.setattr(frame_order, "MOST_CELLS", 3000)
+    assert frame_order._grid_around(frames).size < 2 * 3000
+    assert np.corrcoef(weights_of(frames), fine)[0, 1] > 0.8
 
 
 @pytest.mark.parametrize("visits", [7, 100, 1001])
