@@ -4,7 +4,8 @@
         [--mesh] [--png DIR]
 
 The frames, rounds and keyframes are those of the run (its last map says which frames were keyframes), so that the
-variants see the same data; a variant whose keyframe policy is `every_n` chooses its own. Settings are paths below
+variants see the same data; a variant that sets anything below `keyframes` chooses its own, by the uncertainty volumes
+of the run (its walk had a fixed box, as those of furnished scenes have). Settings are paths below
 `mapping`, as in `gaussian_iterations_per_step=1`; a file (configs/maps/*.toml) gives its table `mapping`. The scene
 file of the run must be there: held-out views are rendered from it. `--mesh` adds the geometry of the mesh that export
 would write, `--png` pictures of two held-out views and a captured one. Prints a Markdown table.
@@ -19,18 +20,16 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from run_folder import FinishedRun
 
-from active3d_pipe.evaluation.geometry_metrics import prepare_truth
 from active3d_pipe.evaluation.image_metrics import psnr, ssim
 from active3d_pipe.mapping import branches, update
 from active3d_pipe.mapping.config import MappingSettings
 from active3d_pipe.mapping.hybrid_map import HybridMap
 from active3d_pipe.mapping.keyframes import Keyframe
 from active3d_pipe.mapping.refine import refine
-from active3d_pipe.pipeline.config import Config, load_run_config
+from active3d_pipe.pipeline.config import Config
 from active3d_pipe.pipeline.layers import read_toml
-from active3d_pipe.sim.observable import held_out_poses, observable_points
-from active3d_pipe.structures import TriangleMesh
 from stages import shared
 
 
@@ -54,7 +53,7 @@ def settings_of(pairs: list[str], base: dict[str, Any] | None = None) -> Mapping
 
 
 def load(run: Path, rounds: int | None) -> SimpleNamespace:
-    """Frames by round, keyframe records, bounds and the configuration of a run."""
+    """Frames and uncertainty volume (where it is) by round, keyframe records and bounds of a run."""
     folders = sorted((run / "capture").glob("round_*"))[:rounds]
     frames = [shared.load_frames(folder) for folder in folders]
     last = sorted((run / "mapping").glob("round_*"))[-1]
@@ -62,7 +61,8 @@ def load(run: Path, rounds: int | None) -> SimpleNamespace:
     for doc in json.loads((last / "keyframes.json").read_text()):
         keyframes[doc["round"]].append(doc)
     bounds = np.array(json.loads((folders[0] / "capture.json").read_text())["rig"]["bounds"])
-    return SimpleNamespace(frames=frames, keyframes=keyframes, bounds=bounds)
+    volumes = [run / "uncertainty" / folder.name for folder in folders]
+    return SimpleNamespace(frames=frames, volumes=volumes, keyframes=keyframes, bounds=bounds)
 
 
 def replay(data: SimpleNamespace, settings: MappingSettings, seed: int) -> tuple[HybridMap, dict[str, float]]:
@@ -70,15 +70,17 @@ def replay(data: SimpleNamespace, settings: MappingSettings, seed: int) -> tuple
     rng = np.random.default_rng(seed)
     hybrid = HybridMap.create(data.bounds[0], data.bounds[1], settings, rng)
     seconds: dict[str, float] = defaultdict(float)
-    recorded = settings.keyframes.policy == "uncertainty"
+    recorded = settings.keyframes == MappingSettings().keyframes
     real = update.select_keyframes
     for k, frames in enumerate(data.frames):
+        volume = None if recorded or k == 0 else shared.load_volume(data.volumes[k - 1])
         if recorded:
             docs = [d for d in data.keyframes[k] if d["step"] - frames[0].step < len(frames)]
             new = [Keyframe(frames[d["step"] - frames[0].step], k, d["reason"], d["delta"], d["gain"], d["rho"])
                    for d in docs]
             update.select_keyframes = lambda *_, new=new: new
-        report = update.update_map(hybrid, frames, None, k, settings, np.random.default_rng([seed, k]), lambda _: None)
+        draws = np.random.default_rng([seed, k])
+        report = update.update_map(hybrid, frames, volume, k, settings, draws, lambda _: None)
         for name, value in report.seconds.items():
             seconds[name] += value
     update.select_keyframes = real
@@ -135,39 +137,29 @@ def main() -> None:
     parser.add_argument("--mesh", action="store_true", help="also judge the mesh")
     parser.add_argument("--png", type=Path, help="folder for pictures of each variant")
     given = parser.parse_args()
-    config = load_run_config(given.run / "run.toml", Config)
     data = load(given.run, given.rounds)
-    simulator = shared.make_simulator(config, config.run.seed)
-    poses = held_out_poses(
-        simulator, given.views, simulator.scene.name, min_clearance_m=config.evaluation.view_clearance_m
-    )
-    views = [simulator.render(T) for T in poses]
+    run = FinishedRun(given.run)
+    views = run.held_out(given.views)
     everything = [f for frames in data.frames for f in frames]
     seen = shared.spread(everything, given.views)
     steps = len(everything)
     print(f"{given.run.name}: {steps} frames in {len(data.frames)} rounds, {len(views)} held-out views", flush=True)
     truth, head, rule = None, "", ""
     if given.mesh:
-        scene = simulator.scene
-        whole = TriangleMesh(scene.vertices.astype(np.float32), scene.faces.astype(np.int32))
-
-        def observable(points: np.ndarray) -> np.ndarray:
-            return observable_points(simulator, points, np.random.default_rng(config.evaluation.seed))
-
-        truth = prepare_truth(whole, config.evaluation, observable)
+        truth = run.truth()
         head, rule = "| accuracy cm | completion cm | C.R. % | MAD cm ", "|---|---|---|---"
-    print(f"| variant | held-out dB | SSIM | train dB | Gaussians {head}| ms/step | by module (ms/step) |")
-    print(f"|---|---|---|---|---{rule}|---|---|", flush=True)
+    print(f"| variant | held-out dB | SSIM | train dB | Gaussians | keyframes {head}| ms/step | by module (ms/step) |")
+    print(f"|---|---|---|---|---|---{rule}|---|---|", flush=True)
     for name, *pairs in given.variant or [["defaults"]]:
         settings = settings_of(pairs)
         hybrid, seconds = replay(data, settings, given.seed)
-        found = geometry(hybrid, everything, config, truth) if given.mesh and not given.refine else ""
+        found = geometry(hybrid, everything, run.config, truth) if given.mesh and not given.refine else ""
         tell(name, hybrid, views, seen, seconds, steps, found or " | ".join("-" * (4 if given.mesh else 0)))
         if given.refine:
             start = time.perf_counter()
             report = refine(hybrid, everything, np.random.default_rng(given.seed), lambda _: None)
             took = time.perf_counter() - start
-            found = geometry(hybrid, everything, config, truth) if given.mesh else ""
+            found = geometry(hybrid, everything, run.config, truth) if given.mesh else ""
             tell(f"{name}, refined {took:.0f} s", hybrid, views, seen, report.seconds, steps, found)
         if given.png:
             save_views(given.png / f"{name}.png", hybrid, [views[0], views[1], seen[len(seen) // 2]])
@@ -181,7 +173,7 @@ def tell(
     train, _ = quality(hybrid, seen)
     modules = ", ".join(f"{n} {1000 * s / steps:.0f}" for n, s in sorted(seconds.items(), key=lambda x: -x[1]))
     total = 1000 * sum(seconds.values()) / steps
-    cells = (f"{held:.2f}", f"{similarity:.3f}", f"{train:.2f}", str(len(hybrid.gaussians)))
+    cells = (f"{held:.2f}", f"{similarity:.3f}", f"{train:.2f}", str(len(hybrid.gaussians)), str(len(hybrid.keyframes)))
     cells += (*([geometry] if geometry else []), f"{total:.0f}", modules)
     print("| " + " | ".join((name, *cells)) + " |", flush=True)
 

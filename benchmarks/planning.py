@@ -33,7 +33,7 @@ from active3d_pipe.planning.policies.registry import make_policy
 from active3d_pipe.sim.config import CameraSettings, SceneSettings, SensorSettings
 from active3d_pipe.sim.observable import observable_points
 from active3d_pipe.sim.simulator import Simulator, make_simulator
-from active3d_pipe.structures import Decision, Frame, TriangleMesh, UncertaintyVolume
+from active3d_pipe.structures import Decision, Frame, UncertaintyVolume
 from active3d_pipe.structures.motion import MotionSettings
 from active3d_pipe.uncertainty import occupancy
 from active3d_pipe.uncertainty.carving import RayEvidence, integrate_depth, looks_in_vain
@@ -207,9 +207,7 @@ def main() -> None:
     times = []
     for file in given.scenes:
         sim = make_simulator(SceneSettings(file=str(file)), CameraSettings(width=150, height=85), SensorSettings(), 0)
-        scene = sim.scene
-        mesh = TriangleMesh(scene.vertices.astype(np.float32), scene.faces.astype(np.int32))
-        points = sample_surface(mesh, given.points, np.random.default_rng(1)).astype(np.float64)
+        points = sample_surface(sim.scene.surface, given.points, np.random.default_rng(1)).astype(np.float64)
         points = points[observable_points(sim, points, np.random.default_rng(0))]
         name = file.resolve().parent.name
         for policy in given.policies:

@@ -53,24 +53,21 @@ class FinishedRun:
     def simulator(self) -> "Simulator":
         return shared.make_simulator(self.config, self.config.run.seed)
 
-    def held_out(self) -> "list[Frame]":
-        """The held-out views of the evaluation, ground truth included."""
+    def held_out(self, views: int | None = None) -> "list[Frame]":
+        """The held-out views of the evaluation, or so many of them, ground truth included."""
         from active3d_pipe.sim.observable import held_out_poses
 
         settings, scene = self.config.evaluation, self.simulator.scene
         poses = held_out_poses(
-            self.simulator, settings.num_views, scene.name, min_clearance_m=settings.view_clearance_m
+            self.simulator, views or settings.num_views, scene.name, min_clearance_m=settings.view_clearance_m
         )
         return [self.simulator.render(T, step=i) for i, T in enumerate(poses)]
 
     def truth(self, *, floors: bool = True) -> "TruthSurface":
         """The true surface, prepared as the evaluation does."""
         from active3d_pipe.evaluation.geometry_metrics import prepare_truth
-        from active3d_pipe.structures import TriangleMesh
 
-        scene = self.simulator.scene
-        whole = TriangleMesh(scene.vertices.astype(np.float32), scene.faces.astype(np.int32))
-        return prepare_truth(whole, self.config.evaluation, self.observable, floors=floors)
+        return prepare_truth(self.simulator.scene.surface, self.config.evaluation, self.observable, floors=floors)
 
     def observable(self, points: np.ndarray) -> np.ndarray:
         """(N,) bool, whether a reachable pose can see each point; the same draw as in the evaluation."""

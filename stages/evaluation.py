@@ -38,7 +38,6 @@ def _run(context: StageContext) -> None:
     from active3d_pipe.sim.observable import observable_points
     from active3d_pipe.storage import meshes
     from active3d_pipe.storage.files import write_json
-    from active3d_pipe.structures import TriangleMesh
 
     config = context.config
     settings = config.evaluation
@@ -49,13 +48,12 @@ def _run(context: StageContext) -> None:
 
     context.progress("ground truth")
     scene = simulator.scene
-    truth_mesh = TriangleMesh(scene.vertices.astype(np.float32), scene.faces.astype(np.int32))
 
     def observable(points: np.ndarray) -> np.ndarray:
         # Seeded by the evaluation, not by the run: every run is judged on the same points.
         return observable_points(simulator, points, np.random.default_rng(settings.seed))
 
-    truth = prepare_truth(truth_mesh, settings, observable)
+    truth = prepare_truth(scene.surface, settings, observable)
     context.progress("geometry")
     seen_by = SeenBy(frames[0].camera, np.stack([f.T_world_camera for f in frames]), [f.depth for f in frames])
     metrics = ev.evaluate_geometry(mesh, truth, settings, seen_by=seen_by, query_sdf=hybrid.field.query_sdf)

@@ -14,7 +14,7 @@ from active3d_pipe.sim import placement, readers
 from active3d_pipe.sim.config import SceneSettings
 from active3d_pipe.sim.digest import scene_name, source_digest
 from active3d_pipe.sim.materials import Material
-from active3d_pipe.structures import check_pose
+from active3d_pipe.structures import TriangleMesh, check_pose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,6 +56,11 @@ class Scene:
 
     def __post_init__(self) -> None:
         check_pose(self.start_pose, f"scene {self.name}: start pose")
+
+    @property
+    def surface(self) -> TriangleMesh:
+        """The bare triangles: what a reconstruction is compared with. World, m."""
+        return TriangleMesh(self.vertices, self.faces)
 
 
 def load_scene(settings: SceneSettings) -> Scene:
