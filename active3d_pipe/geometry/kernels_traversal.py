@@ -150,17 +150,23 @@ def carve_rays(clear, origin, directions, t_hit, t_max, shape, free, hit):
 
 
 @njit(fastmath=True, cache=True)
+def first_voxel(opaque, origin, dx, dy, dz, t_end, nx, ny, nz, ids):
+    """Flat id of the first opaque voxel on a ray, -1 when it meets none before t_end; `ids` as in `walk_ray`."""
+    n = walk_ray(opaque, origin[0], origin[1], origin[2], dx, dy, dz, t_end, nx, ny, nz, ids)
+    return ids[n - 1] if n > 0 and opaque[ids[n - 1]] != 0 else np.int32(-1)
+
+
+@njit(fastmath=True, cache=True)
 def first_hits(opaque, origin, directions, t_end, shape, out_t):
     """Distance (m) at which each ray enters the first opaque voxel, 0 when it meets none before t_end."""
     nx, ny, nz = shape
     ids = np.empty(nx + ny + nz + 3, np.int32)
     for r in range(directions.shape[0]):
         dx, dy, dz = directions[r, 0], directions[r, 1], directions[r, 2]
-        n = walk_ray(opaque, origin[0], origin[1], origin[2], dx, dy, dz, t_end, nx, ny, nz, ids)
+        v = first_voxel(opaque, origin, dx, dy, dz, t_end, nx, ny, nz, ids)
         out_t[r] = ZERO
-        if n == 0 or opaque[ids[n - 1]] == 0:
+        if v < 0:
             continue
-        v = ids[n - 1]
         i, j, k = v // (ny * nz), (v // nz) % ny, v % nz
         # Entry into that voxel alone: the box test, shifted to its corner.
         t = entry_parameter(
@@ -171,12 +177,9 @@ def first_hits(opaque, origin, directions, t_end, shape, out_t):
 
 @njit(fastmath=True, cache=True)
 def first_voxels(opaque, origin, directions, t_end, shape, out_id):
-    """Flat id of the first opaque voxel on each ray, -1 when it meets none before t_end."""
+    """`first_voxel` of each ray of a fan."""
     nx, ny, nz = shape
     ids = np.empty(nx + ny + nz + 3, np.int32)
     for r in range(directions.shape[0]):
-        n = walk_ray(
-            opaque, origin[0], origin[1], origin[2], directions[r, 0], directions[r, 1], directions[r, 2],
-            t_end, nx, ny, nz, ids,
-        )
-        out_id[r] = ids[n - 1] if n > 0 and opaque[ids[n - 1]] != 0 else -1
+        dx, dy, dz = directions[r, 0], directions[r, 1], directions[r, 2]
+        out_id[r] = first_voxel(opaque, origin, dx, dy, dz, t_end, nx, ny, nz, ids)

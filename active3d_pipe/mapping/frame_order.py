@@ -33,8 +33,10 @@ def exposure(frames: Sequence[Frame], rng: np.random.Generator) -> np.ndarray:
     for frame in frames:
         carve(grid, frame.T_world_camera, frame.camera, frame.depth, ray_stride=READING_STRIDE, counts=(free, hit))
     opaque = ((free == 0) | (hit > 0)).view(np.uint8).ravel()  # a look ends at what is not known
-    shown = [_ends(grid, opaque, f.T_world_camera, ray_fan(f.camera, READING_STRIDE)[2], f.camera.far) for f in frames]
-    shown = [ends[hit.ravel()[ends] > 0] for ends in shown]
+    surface, shown = hit.ravel() > 0, []
+    for frame in frames:
+        ends = _ends(grid, opaque, frame.T_world_camera, ray_fan(frame.camera, READING_STRIDE)[2], frame.camera.far)
+        shown.append(ends[surface[ends]])
     by_frames = np.bincount(np.concatenate(shown), minlength=grid.size)
     by_looks = np.bincount(_random_looks(grid, opaque, rng), minlength=grid.size) * (by_frames > 0)
     if not by_looks.any():
