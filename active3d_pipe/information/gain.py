@@ -131,6 +131,7 @@ def information_volumes(
     settings: InformationSettings,
     enough_quality: float,
     credit: np.ndarray | None = None,
+    kind: np.ndarray | None = None,
 ) -> InformationVolumes:
     """Gain quantities of every voxel, from the arrays of an `UncertaintyVolume`.
 
@@ -139,8 +140,10 @@ def information_volumes(
         enough_quality: `InformationSettings.enough_quality` of the camera.
         credit: [X, Y, Z] factor in [0, 1] on everything that is expected of a voxel, e.g. lowered where earlier
             looks brought nothing; None = 1.
+        kind: what `classify` says, where it is known already.
     """
-    kind = classify(arrays, settings)
+    if kind is None:
+        kind = classify(arrays, settings)
     rays = arrays["free_evidence"] + arrays["hit_evidence"]
     u = normalised_uncertainty(arrays["u_final"], rays > 0)
     weight = hybrid_weight(u, arrays["entropy"], settings)

@@ -71,10 +71,13 @@ def coarse_positions(space: FreeSpace, settings: PlanningSettings) -> np.ndarray
     Blocks have the coarse spacing, or the smallest multiple of it at which there are at most `max_positions`.
     """
     spacing, reachable = settings.coarse_spacing_m, space.reachable
+    count = int(np.count_nonzero(reachable))
     while True:
-        found = _thin(reachable, space, spacing)
-        if len(found) <= settings.max_positions:
-            return found
+        # Full blocks are the fewest that so many voxels can lie in.
+        if count <= settings.max_positions * _block(space, spacing) ** 3:
+            found = _thin(reachable, space, spacing)
+            if len(found) <= settings.max_positions:
+                return found
         spacing *= 1.2
 
 
@@ -92,5 +95,9 @@ def fine_positions(space: FreeSpace, around: np.ndarray, settings: PlanningSetti
 
 def _thin(allowed: np.ndarray, space: FreeSpace, spacing_m: float) -> np.ndarray:
     """(P, 3) int64, one allowed voxel of every cubic block (`best_of_blocks`)."""
-    block = max(1, round(spacing_m / space.grid.voxel_size))
-    return best_of_blocks(allowed.view(np.uint8), space.risk.clearance_m, block)
+    return best_of_blocks(allowed.view(np.uint8), space.risk.clearance_m, _block(space, spacing_m))
+
+
+def _block(space: FreeSpace, spacing_m: float) -> int:
+    """Edge of a block in voxels."""
+    return max(1, round(spacing_m / space.grid.voxel_size))

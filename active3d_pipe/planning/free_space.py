@@ -26,6 +26,7 @@ class FreeSpace:
         checked_m: (X, Y, Z) float32, the clearance that paths are checked against: that of the risk field, but 0
             near a tight start where something solid is too close.
         passable: (X, Y, Z) bool, the agent's centre may be in this voxel.
+        moves: (X, Y, Z) int32 bits, the neighbours that it may go on to (`kernels_distance.open_moves`).
         start: (3,) int64 voxel of the agent.
         required_m: clearance that `passable` demands away from the start.
         escape_m: clearance that it demands near the start; smaller when the agent stands in a tight spot.
@@ -38,6 +39,7 @@ class FreeSpace:
     free: np.ndarray
     checked_m: np.ndarray
     passable: np.ndarray
+    moves: np.ndarray
     start: np.ndarray
     required_m: float
     escape_m: float
@@ -68,17 +70,16 @@ class FreeSpace:
 
     def moved_to(self, voxel: np.ndarray, settings: PlanningSettings, longest: float) -> "FreeSpace":
         """The same space seen from another reachable voxel; costs up to `longest` only."""
-        cost, parent = _geodesic(self.risk, self.passable, voxel, self.planar, settings, longest)
+        cost, parent = _geodesic(self.risk, self.moves, voxel, settings, longest)
         return replace(self, start=np.asarray(voxel, dtype=np.int64), cost=cost, parent=parent)
 
 
 def _geodesic(
-    risk: RiskField, passable: np.ndarray, start: np.ndarray, planar: bool, settings: PlanningSettings, longest: float
+    risk: RiskField, moves: np.ndarray, start: np.ndarray, settings: PlanningSettings, longest: float
 ) -> tuple[np.ndarray, np.ndarray]:
     rate = (1 + np.float32(settings.lambda_risk) * risk.risk).astype(np.float32)
     return kernels.geodesic(
-        passable.view(np.uint8), rate, np.asarray(start, dtype=np.int64), np.float32(risk.grid.voxel_size), planar,
-        np.float32(longest),
+        moves, rate, np.asarray(start, dtype=np.int64), np.float32(risk.grid.voxel_size), np.float32(longest)
     )
 
 
@@ -177,11 +178,12 @@ def begin_free_space(
         checked = _open_escape(passable, clear, solid, grid, position, (required, escape), settings)
     passable[tuple(start)] = True
     planar = motion.model == "ground"
+    moves = kernels.open_moves(passable.view(np.uint8), planar)
     pool = ThreadPoolExecutor(1)
-    found = pool.submit(_geodesic, risk, passable, start, planar, settings, UNREACHABLE)
+    found = pool.submit(_geodesic, risk, moves, start, settings, UNREACHABLE)
     pool.shutdown(wait=False)
     return lambda: FreeSpace(
-        risk, free, checked, passable, start, required, escape, *found.result(), planar
+        risk, free, checked, passable, moves, start, required, escape, *found.result(), planar
     )
 
 

@@ -7,6 +7,11 @@ import numpy as np
 from numba import njit, prange
 
 FAR = np.float32(1e30)
+LOW = np.uint64(0xFFFFFFFF)
+ALL_ROWS = (1 << 27) - 1
+ALL_BUT_OLDEST = sum(0b110 << 3 * row for row in range(9))
+ALL_MOVES = ALL_ROWS & ~(1 << 13)
+LEVEL_MOVES = sum(1 << 3 * row + 1 for row in range(9)) & ~(1 << 13)
 
 
 @njit(cache=True)
@@ -72,93 +77,133 @@ def distance_transform(source, reach, chebyshev):
     return d
 
 
-@njit(cache=True)
-def _push(keys, ids, n, key, v):
+@njit(inline="always")
+def _push(heap, n, entry):
+    """Add an entry to the heap of n, whose every node has four children; returns the new size."""
     i = n
     while i > 0:
-        parent = (i - 1) >> 1
-        if keys[parent] <= key:
+        above = (i - 1) >> 2
+        if heap[np.uintp(above)] <= entry:
             break
-        keys[i], ids[i] = keys[parent], ids[parent]
-        i = parent
-    keys[i], ids[i] = key, v
+        heap[np.uintp(i)] = heap[np.uintp(above)]
+        i = above
+    heap[np.uintp(i)] = entry
     return n + 1
 
 
-@njit(cache=True)
-def _pop(keys, ids, n):
-    """Remove the root; the last element sinks from the top. Returns the new size."""
+@njit(inline="always")
+def _pop(heap, n):
+    """Remove the least entry, the root; the last one sinks from the top. Returns the new size."""
     n -= 1
-    key, v = keys[n], ids[n]
+    entry = heap[np.uintp(n)]
     i = 0
     while True:
-        child = 2 * i + 1
+        child = 4 * i + 1
         if child >= n:
             break
-        if child + 1 < n and keys[child + 1] < keys[child]:
-            child += 1
-        if keys[child] >= key:
+        least, value = child, heap[np.uintp(child)]
+        for c in range(child + 1, min(child + 4, n)):
+            if heap[np.uintp(c)] < value:
+                least, value = c, heap[np.uintp(c)]
+        if value >= entry:
             break
-        keys[i], ids[i] = keys[child], ids[child]
-        i = child
-    keys[i], ids[i] = key, v
+        heap[np.uintp(i)] = value
+        i = least
+    heap[np.uintp(i)] = entry
     return n
 
 
-@njit(nogil=True, cache=True)
-def geodesic(passable, rate, start, voxel_size, planar, limit):
-    """Dijkstra over the 26 neighbours (8 when `planar`) from the voxel `start` (3,).
+@njit(cache=True)
+def _moves_at(passable, i, j, k):
+    """Bits of `open_moves` of one voxel, level or not."""
+    nx, ny, nz = passable.shape
+    bits = 0
+    for m in range(27):
+        x, y, z = i + m // 9 - 1, j + m // 3 % 3 - 1, k + m % 3 - 1
+        steps = (x != i) + (y != j) + (z != k)
+        if steps == 0 or x < 0 or y < 0 or z < 0 or x >= nx or y >= ny or z >= nz or passable[x, y, z] == 0:
+            continue
+        if steps > 1 and (passable[x, j, k] == 0 or passable[i, y, k] == 0 or passable[i, j, z] == 0):
+            continue
+        if steps == 3 and (passable[x, y, k] == 0 or passable[x, j, z] == 0 or passable[i, y, z] == 0):
+            continue
+        bits |= 1 << m
+    return bits
 
-    An edge costs its length (m) times the mean `rate` of its ends. No corners are cut: a diagonal needs every
-    voxel of the box that it spans to be passable. Stops at cost `limit`. Returns cost (FAR = unreachable) and
-    the flat id of each voxel's parent (-1 at the start and where unreachable).
+
+@njit(parallel=True, cache=True)
+def open_moves(passable, planar):
+    """Which of its 26 neighbours (8 when `planar`) each passable voxel may be left for; int32 bits [X, Y, Z].
+
+    Bit 9 (a + 1) + 3 (b + 1) + c + 1 stands for the step (a, b, c). No corners are cut: a diagonal needs every voxel of
+    the box that it spans to be passable. passable: uint8 [X, Y, Z], 1 or 0.
     """
     nx, ny, nz = passable.shape
-    cost = np.full((nx, ny, nz), FAR, np.float32)
-    parent = np.full((nx, ny, nz), -1, np.int32)
-    done = np.zeros((nx, ny, nz), np.uint8)
-    capacity = 4096
-    keys, ids = np.empty(capacity, np.float32), np.empty(capacity, np.int32)
-    cost[start[0], start[1], start[2]] = 0
-    n = _push(keys, ids, 0, np.float32(0), (start[0] * ny + start[1]) * nz + start[2])
-    kz = 0 if planar else 1
+    out = np.zeros((nx, ny, nz), np.int32)
+    allowed = LEVEL_MOVES if planar else ALL_MOVES
+    for i in prange(nx):
+        for j in range(ny):
+            inside = 0 < i < nx - 1 and 0 < j < ny - 1
+            around = 0  # nine rows along z of the voxels k - 1, k, k + 1, three bits each; the newest is the lowest
+            for k in range(nz):
+                if inside and k + 1 < nz:
+                    newest = 0
+                    for row in range(9):
+                        newest |= np.int64(passable[i + row // 3 - 1, j + row % 3 - 1, k + 1]) << (3 * row)
+                    around = (around << 1) & ALL_BUT_OLDEST | newest
+                if passable[i, j, k] == 0:
+                    continue
+                if inside and 0 < k < nz - 1 and around == ALL_ROWS:
+                    out[i, j, k] = allowed
+                else:
+                    out[i, j, k] = _moves_at(passable, i, j, k) & allowed
+    return out
+
+
+@njit(nogil=True, cache=True)
+def geodesic(moves, rate, start, voxel_size, limit):
+    """Dijkstra along `moves` (`open_moves`) from the voxel `start` (3,).
+
+    An edge costs its length (m) times the mean `rate` of its ends. Voxels of equal cost are left in the order of their
+    ids. Stops at cost `limit`. Returns cost (FAR = unreachable) and the flat id of each voxel's parent (-1 at the start
+    and where unreachable).
+    """
+    nx, ny, nz = moves.shape
+    cost, parent = np.full(nx * ny * nz, FAR, np.float32), np.full(nx * ny * nz, -1, np.int32)
+    # Costs are not negative, so their bits have their order: a heap entry is (bits of the cost, voxel) in one integer.
+    cost_bits = cost.view(np.uint32)
+    bits, rates = moves.reshape(-1), rate.reshape(-1)
+    offset, half_length = np.zeros(27, np.int64), np.zeros(27, np.float32)
+    for m in range(27):
+        a, b, c = m // 9 - 1, m // 3 % 3 - 1, m % 3 - 1
+        offset[m] = (a * ny + b) * nz + c
+        half_length[m] = np.sqrt(np.float32(abs(a) + abs(b) + abs(c))) * voxel_size * np.float32(0.5)
+    heap = np.empty(4096, np.uint64)
+    first = (start[0] * ny + start[1]) * nz + start[2]
+    cost[first] = 0
+    n = _push(heap, 0, np.uint64(first))
     while n > 0:
-        v = ids[0]
-        n = _pop(keys, ids, n)
-        i, j, k = v // (ny * nz), (v // nz) % ny, v % nz
-        if done[i, j, k]:
-            continue
-        done[i, j, k] = 1
-        c0 = cost[i, j, k]
+        entry = heap[0]
+        n = _pop(heap, n)
+        v = np.uintp(entry & LOW)
+        if np.uint32(entry >> np.uint64(32)) > cost_bits[v]:
+            continue  # a cheaper way was found after this one
+        c0, moves_here, rate_here = cost[v], bits[v], rates[v]
         if c0 > limit:
             break
-        for a in range(-1, 2):
-            for b in range(-1, 2):
-                for c in range(-kz, kz + 1):
-                    x, y, z = i + a, j + b, k + c
-                    if x < 0 or y < 0 or z < 0 or x >= nx or y >= ny or z >= nz:
-                        continue
-                    if passable[x, y, z] == 0 or done[x, y, z]:
-                        continue
-                    steps = abs(a) + abs(b) + abs(c)
-                    if steps > 1:
-                        # All voxels of the spanned box: each offset either taken or not.
-                        if passable[x, j, k] == 0 or passable[i, y, k] == 0 or passable[i, j, z] == 0:
-                            continue
-                        if steps == 3 and (
-                            passable[x, y, k] == 0 or passable[x, j, z] == 0 or passable[i, y, z] == 0
-                        ):
-                            continue
-                    edge = np.sqrt(np.float32(steps)) * voxel_size
-                    new = c0 + edge * np.float32(0.5) * (rate[i, j, k] + rate[x, y, z])
-                    if new < cost[x, y, z]:
-                        cost[x, y, z] = new
-                        parent[x, y, z] = v
-                        if n == len(keys):
-                            keys = np.concatenate((keys, np.empty(len(keys), np.float32)))
-                            ids = np.concatenate((ids, np.empty(len(ids), np.int32)))
-                        n = _push(keys, ids, n, new, (x * ny + y) * nz + z)
-    return cost, parent
+        if n + 27 > len(heap):
+            heap = np.concatenate((heap, np.empty(len(heap), np.uint64)))
+        for m in range(27):
+            if moves_here >> m & 1 == 0:
+                continue
+            u = np.uintp(np.int64(v) + offset[m])
+            if cost[u] <= c0:
+                continue
+            new = c0 + half_length[m] * (rate_here + rates[u])
+            if new < cost[u]:
+                cost[u], parent[u] = new, v
+                n = _push(heap, n, np.uint64(cost_bits[u]) << np.uint64(32) | np.uint64(u))
+    return cost.reshape(moves.shape), parent.reshape(moves.shape)
 
 
 @njit(cache=True)

@@ -88,7 +88,7 @@ def build_reward_field(
     credit, cell_credit = np.float32(settings.credit_factor) ** looks
     # An eighth of what an open voxel is worth that may turn out either way, times the weight.
     whole = settings.cell_weight * (information.alpha + information.beta) / 16
-    volumes = information_volumes(volume.arrays, information, enough, credit.reshape(grid.shape))
+    volumes = information_volumes(volume.arrays, information, enough, credit.reshape(grid.shape), kind)
     return RewardField(
         grid, information.quality_range_m(camera.fx), enough, reach, kind.ravel(), opaque, skip,
         volumes.value.ravel(), through, volumes.surface_value.ravel(), quality, normal.reshape(-1, 3),

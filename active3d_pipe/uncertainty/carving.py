@@ -56,14 +56,10 @@ def integrate_depth(grid: VoxelGrid, frames: Sequence[Frame], settings: Uncertai
     free, hit = np.zeros(shape, np.int32), np.zeros(shape, np.int32)
     quality = np.zeros(shape, np.float32)
     passed, ended = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
-    s = settings.ray_stride
     for group in by_image_size(frames):
-        starts = np.array([(f.step // s % s, f.step % s) for f in group], np.int64)
         kernels.carve_frames(
-            np.stack([f.depth for f in group]), intrinsics([f.camera for f in group]),
-            np.stack([f.T_world_camera for f in group])[:, :3].astype(np.float64),
-            np.array([(f.camera.near, f.camera.far) for f in group], np.float64), starts, s,
-            grid.origin, 1 / grid.voxel_size, settings.reference_footprint_m, free, hit, quality, passed, ended,
+            *_stacked(group, settings), grid.origin, 1 / grid.voxel_size, settings.reference_footprint_m, free, hit,
+            quality, passed, ended,
         )
     return RayEvidence(
         free.sum(0).astype(np.float32), hit.sum(0).astype(np.float32), quality.max(0),
@@ -81,18 +77,32 @@ def looks_in_vain(
     its neighbours cross the same voxels.
     """
     s = settings.ray_stride
-    vain, stamp = np.zeros(grid.shape, np.uint8), np.full(grid.shape, -1, np.int32)
+    vain = np.zeros((kernels.CHUNKS, *grid.shape), np.uint8)
     blocked = np.ascontiguousarray(solid, np.uint8)
-    for n, f in enumerate(frames):
-        start = (f.step // s % s, f.step % s)
-        if ((depth := f.depth[start[0] :: s, start[1] :: s]) >= f.camera.near).sum() == depth.size:
-            continue
+    starts = [_start(f, s) for f in frames]
+    lossy = [f for f, (i, j) in zip(frames, starts, strict=True) if not (f.depth[i::s, j::s] >= f.camera.near).all()]
+    for group in by_image_size(lossy):
         kernels.mark_vain(
-            f.depth, tuple(intrinsics([f.camera])[0]), f.T_world_camera[:3].astype(np.float64),
-            (f.camera.near, f.camera.far), start, s, grid.origin, 1 / grid.voxel_size, settings.vain_range_m,
-            blocked, stamp, n, vain,
+            *_stacked(group, settings), grid.origin, 1 / grid.voxel_size, settings.vain_range_m, blocked, vain
         )
-    return vain.astype(np.float32)
+    return np.bitwise_or.reduce(vain).astype(np.float32)
+
+
+def _start(frame: Frame, stride: int) -> tuple[int, int]:
+    """First row and column that cast rays; they shift with the step, so that frames fill each other's gaps."""
+    return frame.step // stride % stride, frame.step % stride
+
+
+def _stacked(
+    frames: Sequence[Frame], settings: UncertaintySettings
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]:
+    """Frames of one image size as the kernels take them: depths, cameras, poses, reaches, first pixels, stride."""
+    return (
+        np.stack([f.depth for f in frames]), intrinsics([f.camera for f in frames]),
+        np.stack([f.T_world_camera for f in frames])[:, :3].astype(np.float64),
+        np.array([(f.camera.near, f.camera.far) for f in frames], np.float64),
+        np.array([_start(f, settings.ray_stride) for f in frames], np.int64), settings.ray_stride,
+    )
 
 
 def by_image_size(items: Sequence) -> Iterator[list]:

@@ -1,5 +1,6 @@
 """View-dependent local uncertainty: residuals of the Gaussian branch, back-projected (eq. view_uncertainty)."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -21,6 +22,8 @@ QuerySdf = Callable[[np.ndarray], np.ndarray]
 MIN_WEIGHT = 0.25
 # A neighbourhood counts as seen from this many views (a view beside the voxel counts by the blur's weight).
 MIN_VIEWS = 0.01
+# How far the blur of residuals reaches, standard deviations.
+BLUR_REACH = 2.0
 # px between the depth samples that tell where a frame looks
 CHOICE_STRIDE = 24
 
@@ -166,12 +169,25 @@ def explicit_uncertainty(
         return before
     residual, coverage = backproject(grid, views, settings)
     count = coverage * np.float32(len(views))
+    looked_at = _box_of(count > 0, math.ceil(BLUR_REACH * settings.residual_blur_voxels) + 1)
+    residual, count, then = residual[looked_at], count[looked_at], before[looked_at]
     if settings.residual_blur_voxels > 0:
-        blur = partial(gaussian_filter, sigma=settings.residual_blur_voxels, mode="constant", truncate=2.0)
+        blur = partial(gaussian_filter, sigma=settings.residual_blur_voxels, mode="constant", truncate=BLUR_REACH)
         total, count = blur(residual * count), blur(count)
         seen = count > MIN_VIEWS
         residual = np.where(seen, total / np.where(seen, count, 1), 0)
         count = np.where(seen, count, 0)
-    memory = np.float32(settings.residual_memory) * (before > 0)
+    memory = np.float32(settings.residual_memory) * (then > 0)
     gain = np.divide(count, count + memory, out=np.zeros_like(count), where=count > 0)
-    return (before + gain * (residual - before)).astype(np.float32)
+    out = before.copy()
+    out[looked_at] = then + gain * (residual - then)
+    return out
+
+
+def _box_of(mask: np.ndarray, margin: int) -> tuple[slice, ...]:
+    """The smallest box, and a margin, that holds all that is true in a volume: views look at a part of it."""
+    box = []
+    for axis in range(3):
+        at = np.flatnonzero(mask.any(axis=tuple(a for a in range(3) if a != axis)))
+        box.append(slice(max(int(at[0]) - margin, 0), int(at[-1]) + margin + 1) if len(at) else slice(0, 0))
+    return tuple(box)

@@ -196,43 +196,58 @@ def carve_frames(
 
 
 @njit(cache=True)
-def _mark_path(ox, oy, oz, ex, ey, ez, shape, blocked, stamp, frame_id, vain, seen_id):
-    """Stamp the voxels of the segment o -> e up to the first blocked one; with `vain`, stamp only what is unstamped.
-
-    `stamp` holds 2 * frame + 1 where a reading passed in this frame and 2 * frame + 2 where only lost rays did.
-    """
+def _stamp_path(ox, oy, oz, ex, ey, ez, shape, stamp, frame_id):
+    """Stamp the voxels of the segment o -> e (voxel units)."""
     v, _, t1, pitch, left, border, length = _enter(ox, oy, oz, ex, ey, ez, shape)
     while v >= 0:
-        if vain and blocked[np.uintp(v)]:
-            return
-        if not vain or stamp[np.uintp(v)] != seen_id:
-            stamp[np.uintp(v)] = frame_id
+        stamp[np.uintp(v)] = frame_id
         v, _, left, border = _advance(v, t1, pitch, left, border, length)
 
 
 @njit(cache=True)
-def mark_vain(depth, camera, pose, reach, start, stride, origin, inv_voxel, range_m, blocked, stamp, frame, vain):
-    """vain = 1 in voxels up to depth `range_m` that only rays without a reading crossed in this frame.
+def _mark_lost(ox, oy, oz, ex, ey, ez, shape, blocked, stamp, frame_id, vain):
+    """vain = 1 in the voxels of the segment o -> e up to the first blocked one that bear no stamp of this frame."""
+    v, _, t1, pitch, left, border, length = _enter(ox, oy, oz, ex, ey, ez, shape)
+    while v >= 0 and not blocked[np.uintp(v)]:
+        if stamp[np.uintp(v)] != frame_id:
+            vain[np.uintp(v)] = 1
+        v, _, left, border = _advance(v, t1, pitch, left, border, length)
 
-    blocked, vain (X, Y, Z) uint8, stamp (X, Y, Z) i32 that starts below 0; see `_mark_path`.
-    """
+
+@njit(cache=True)
+def _mark_vain(depth, camera, pose, reach, start, stride, grid, range_m, blocked, stamp, frame_id, vain):
+    """One frame of `mark_vain`; volumes of `blocked.shape`, stamp and vain flat."""
     near, far = reach
-    seen_id, lost_id = 2 * frame + 1, 2 * frame + 2
+    origin, inv_voxel = grid
+    # Lost rays end at depth `range_m`: of the others no more is needed than the voxels that reach so near.
+    longest = min(far, range_m + 2.0 / inv_voxel)
     ox, oy, oz = _pixel_end(0, 0, 0.0, camera, pose, origin, inv_voxel)
-    flat_stamp, flat_blocked, flat_vain = stamp.ravel(), blocked.ravel(), vain.ravel()
     for lost in range(2):
         for i in range(start[0], depth.shape[0], stride):
             for j in range(start[1], depth.shape[1], stride):
                 d = depth[i, j]
-                has_reading = d >= near and d > 0.0 and d < math.inf
-                if has_reading == (lost == 1):
+                if (d >= near and d > 0.0 and d < math.inf) == (lost == 1):
                     continue
-                e = range_m if lost else min(d, far)
-                ex, ey, ez = _pixel_end(i, j, e, camera, pose, origin, inv_voxel)
-                _mark_path(
-                    ox, oy, oz, ex, ey, ez, stamp.shape, flat_blocked, flat_stamp, lost_id if lost else seen_id,
-                    lost == 1, seen_id,
-                )
-    for v in range(flat_stamp.size):
-        if flat_stamp[v] == lost_id:
-            flat_vain[v] = 1
+                end = range_m if lost else min(d, longest)
+                ex, ey, ez = _pixel_end(i, j, end, camera, pose, origin, inv_voxel)
+                if lost:
+                    _mark_lost(ox, oy, oz, ex, ey, ez, blocked.shape, blocked.ravel(), stamp, frame_id, vain)
+                else:
+                    _stamp_path(ox, oy, oz, ex, ey, ez, blocked.shape, stamp, frame_id)
+
+
+@njit(parallel=True, cache=True)
+def mark_vain(depths, cameras, poses, reaches, starts, stride, origin, inv_voxel, range_m, blocked, vain):
+    """vain = 1 in voxels up to depth `range_m` that in some frame only rays without a reading crossed.
+
+    blocked (X, Y, Z) uint8 stops such rays; vain (CHUNKS, X, Y, Z) uint8, in place; the rest as in `carve_frames`.
+    """
+    for c in prange(CHUNKS):
+        stamp = np.full(blocked.size, -1, np.int32)
+        flat_vain = vain[c].ravel()
+        for f in range(c, depths.shape[0], CHUNKS):
+            camera = (cameras[f, 0], cameras[f, 1], cameras[f, 2], cameras[f, 3])
+            _mark_vain(
+                depths[f], camera, poses[f], (reaches[f, 0], reaches[f, 1]), (starts[f, 0], starts[f, 1]), stride,
+                (origin, inv_voxel), range_m, blocked, stamp, f, flat_vain,
+            )

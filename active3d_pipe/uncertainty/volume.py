@@ -154,7 +154,7 @@ def _query(
     """SDF and sigma at the centres of the voxels in `mask`, m, elsewhere the SDF of `previous`; without one, of all."""
     if previous is None:
         mask = np.ones(grid.shape, bool)
-    points = grid.centres()[mask]
+    points = np.stack([grid.axis(i).astype(np.float32)[at] for i, at in enumerate(np.nonzero(mask))], axis=-1)
     values = field_query(points)
     out = []
     for name, value in zip(("sdf", "sigma"), values, strict=True):

@@ -1,13 +1,18 @@
+from itertools import product
+
 import box_world
 import numpy as np
 import pytest
 from scipy.ndimage import correlate1d
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
 
 from active3d_pipe.geometry import se3
 from active3d_pipe.planning.candidates import coarse_positions, fine_positions, view_directions
 from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.free_space import build_free_space, clearance, mark_body
 from active3d_pipe.planning.kernels_candidates import best_of_blocks, spread_values
+from active3d_pipe.planning.kernels_distance import geodesic, open_moves
 from active3d_pipe.planning.risk_field import joint_occupancy
 from active3d_pipe.structures import Camera, VoxelGrid
 from active3d_pipe.structures.motion import MotionSettings
@@ -84,6 +89,50 @@ def test_geodesic_is_no_shorter_than_the_straight_line_and_follows_passable_voxe
     assert space.passable[tuple(path.T)].all()
 
 
+def slow_moves(passable, planar):
+    """{voxel: neighbours}: every voxel of the box that a step spans must be passable."""
+    found = {}
+    for v in map(tuple, np.argwhere(passable).tolist()):
+        found[v] = []
+        for step in np.ndindex(3, 3, 3):
+            to = tuple(int(a + b - 1) for a, b in zip(v, step))
+            if to == v or (planar and to[2] != v[2]) or min(to) < 0 or (np.array(to) >= passable.shape).any():
+                continue
+            if all(passable[corner] for corner in product(*({a, b} for a, b in zip(v, to)))):
+                found[v].append(to)
+    return found
+
+
+@pytest.mark.parametrize("planar", [False, True])
+@pytest.mark.parametrize("share", [0.0, 0.06, 0.35])
+def test_moves_and_geodesic_costs_equal_the_slow_ones(planar, share):
+    rng = np.random.default_rng(5)
+    passable = (rng.random((9, 8, 6)) >= share).astype(np.uint8)
+    start = tuple(np.argwhere(passable)[40].tolist())
+    moves, slow = open_moves(passable, planar), slow_moves(passable, planar)
+    for v in np.ndindex(passable.shape):
+        bits = {9 * (a - v[0] + 1) + 3 * (b - v[1] + 1) + c - v[2] + 1 for a, b, c in slow.get(v, [])}
+        assert moves[v] == sum(1 << bit for bit in bits), v
+    rate = rng.uniform(1, 3, passable.shape).astype(np.float32)
+    number = {v: n for n, v in enumerate(slow)}
+    edges = [(number[v], number[u], 0.1 * np.linalg.norm(np.subtract(v, u)) * (rate[v] + rate[u]) / 2)
+             for v, near in slow.items() for u in near]
+    rows, columns, lengths = (np.array(a) for a in zip(*edges))
+    graph = coo_matrix((lengths, (rows, columns)), shape=(len(slow), len(slow))).tocsr()
+    want = dijkstra(graph, indices=number[start])
+    cost, parent = geodesic(moves, rate, np.array(start), np.float32(0.1), np.float32(1e29))
+    got = np.array([cost[v] for v in slow], np.float64)
+    np.testing.assert_allclose(np.where(got > 1e29, np.inf, got), want, rtol=1e-5)
+    assert (cost[passable == 0] > 1e29).all()
+    for v in slow:
+        if v != start and cost[v] < 1e29:
+            before = tuple(int(c) for c in np.unravel_index(parent[v], passable.shape))
+            length = 0.1 * np.linalg.norm(np.subtract(v, before)) * (rate[v] + rate[before]) / 2
+            assert cost[v] == pytest.approx(cost[before] + length, rel=1e-5)
+    near = geodesic(moves, rate, np.array(start), np.float32(0.1), np.float32(0.3))[0]
+    assert (near[cost <= 0.3] == cost[cost <= 0.3]).all()
+
+
 def test_risk_is_one_at_the_body_zero_in_the_open_and_never_rises_with_clearance(seen):
     _, volume, T, walked = seen
     risk = build_free_space(volume, T, walked, MOTION, SETTINGS).risk
@@ -115,6 +164,10 @@ def test_candidates_cover_all_reachable_space(seen):
     assert nearest.max() <= SETTINGS.coarse_spacing_m * 3**0.5
     few = coarse_positions(space, PlanningSettings(max_positions=5))
     assert 1 <= len(few) <= 5
+    block = SETTINGS.coarse_spacing_m / space.grid.voxel_size
+    while len(found := best_of_blocks(space.reachable.view(np.uint8), space.risk.clearance_m, round(block))) > 5:
+        block *= 1.2
+    assert (few == found).all()
     fine = fine_positions(space, coarse[:2], SETTINGS)
     assert space.reachable[tuple(fine.T)].all()
     assert np.abs(fine - coarse[0]).max(axis=1).min() <= 5

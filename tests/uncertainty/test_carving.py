@@ -6,7 +6,7 @@ from uncertainty_room import CAMERA, SIZE, frame, frames, pose, room_grid, trace
 
 from active3d_pipe.geometry import projection, se3, voxel_traversal
 from active3d_pipe.structures import Camera, Frame, VoxelGrid
-from active3d_pipe.uncertainty.carving import integrate_depth
+from active3d_pipe.uncertainty.carving import integrate_depth, looks_in_vain
 from active3d_pipe.uncertainty.config import UncertaintySettings
 
 EVERY_PIXEL = UncertaintySettings(ray_stride=1)
@@ -69,6 +69,47 @@ def test_counts_equal_exact_intersection(yaw, position):
     assert unsure.mean() < 0.05
     np.testing.assert_array_equal(got.free[~unsure], free[~unsure])
     np.testing.assert_array_equal(got.hit[~unsure], hit[~unsure])
+
+
+def test_looks_in_vain_equal_exact_intersection():
+    """Voxels up to a range that only lost rays cross, up to the first solid one, in any of three frames."""
+    grid, camera, rng = room_grid(0.19), Camera.from_fov(16, 12, 90), np.random.default_rng(2)
+    settings = UncertaintySettings(ray_stride=1, vain_range_m=1.1)
+    solid = np.zeros(grid.shape, bool)
+    solid[6:8, :, 5] = True
+    taken, want, unsure = [], np.zeros(grid.shape, bool), np.zeros(grid.shape, bool)
+    for n, yaw in enumerate((17.0, -140.0, 80.0)):
+        T = pose(yaw, (0.9, 1.1, 1.2))
+        depth = trace(T, camera)
+        depth[rng.random(depth.shape) < 0.5] = 0
+        depth[2:9, 4:12] = 0
+        taken.append(Frame(n, 0, camera, T, np.zeros((12, 16, 3), np.uint8), depth))
+        o = (T[:3, 3] - grid.origin) / grid.voxel_size
+        ends = np.where(depth > 0, depth, settings.vain_range_m)[..., None] * projection.pixel_rays(camera)
+        lengths = [
+            crossing_length(grid, o, (p - grid.origin) / grid.voxel_size)
+            for p in se3.transform_points(T, ends.astype(float)).reshape(-1, 3)
+        ]
+        read = np.zeros(grid.shape, bool)
+        for length, d in zip(lengths, depth.ravel()):
+            unsure |= np.abs(length) < 1e-5
+            if d > 0:
+                read |= length > 0
+        for length, d in zip(lengths, depth.ravel()):
+            if d > 0:
+                continue
+            crossed = [v for v in map(tuple, np.argwhere(length > 0))]
+            crossed.sort(key=lambda v: np.linalg.norm(np.array(v) + 0.5 - o))
+            walls = [m for m, v in enumerate(crossed) if solid[v]]
+            for v in crossed[: walls[0]] if walls else crossed:
+                want[v] |= not read[v]
+            if walls:  # the order of the voxels by their centres is not quite that of the ray
+                for v in crossed[walls[0] - 1 :]:
+                    unsure[v] = True
+    got = looks_in_vain(grid, taken, solid, settings) > 0
+    assert want.sum() > 100
+    assert unsure.mean() < 0.2
+    np.testing.assert_array_equal(got[~unsure], want[~unsure])
 
 
 def test_agrees_with_the_traversal_of_the_planner():
