@@ -97,7 +97,7 @@ def decide_again(run: FinishedRun, k: int, repeats: int) -> dict[str, float]:
                 stack.enter_context(patch.object(owner, name, watch.wrapped(getattr(owner, name), label)))
             volume = watch.wrapped(volumes.compute_volume, "volume: terms, fusion, entropy")(
                 grid=before.grid, round=k, previous=before, field_query=hybrid.field.query_geometry,
-                gaussians=hybrid.gaussians.to_model(), new_frames=frames, views=views, predicted=predicted,
+                gaussians=hybrid.gaussians.to_model(copy=False), new_frames=frames, views=views, predicted=predicted,
                 settings=settings,
             )
             watch.wrapped(decide.decide, "choice, and waiting for distances")(

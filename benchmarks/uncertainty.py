@@ -80,7 +80,7 @@ def replay(run: Path, given: argparse.Namespace) -> list[dict]:
         start = time.perf_counter()
         volume = compute_volume(
             grid=grid, round=k, previous=volume, field_query=hybrid.field.query_geometry,
-            gaussians=hybrid.gaussians.to_model(), new_frames=frames, views=views, predicted=predicted,
+            gaussians=hybrid.gaussians.to_model(copy=False), new_frames=frames, views=views, predicted=predicted,
             settings=settings,
         )
         spent["volume"] += time.perf_counter() - start

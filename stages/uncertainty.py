@@ -78,7 +78,7 @@ def _run(context: StageContext) -> None:
     start = time.perf_counter()
     volume = compute_volume(
         grid=grid, round=k, previous=previous, field_query=hybrid.field.query_geometry,
-        gaussians=hybrid.gaussians.to_model(), new_frames=frames, views=views, predicted=predicted,
+        gaussians=hybrid.gaussians.to_model(copy=False), new_frames=frames, views=views, predicted=predicted,
         settings=config.uncertainty,
     )
     context.timings["volume"] = time.perf_counter() - start

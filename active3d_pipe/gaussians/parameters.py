@@ -52,11 +52,11 @@ class GaussianParameters:
     def _fresh(cls, values: np.ndarray) -> "GaussianParameters":
         return cls(torch.from_numpy(values), *_no_moments(len(values)))
 
-    def to_model(self) -> GaussianModel:
-        """A copy as plain arrays."""
+    def to_model(self, *, copy: bool = True) -> GaussianModel:
+        """As plain arrays: a copy, or views for who only reads and is done before the next change."""
         v = self.values.detach().numpy()
         columns = (MEANS, LOG_SCALES, QUATS, OPACITY_LOGITS, COLORS)
-        return GaussianModel(*(np.ascontiguousarray(v[:, c]).copy() for c in columns))
+        return GaussianModel(*(v[:, c].copy() if copy else v[:, c] for c in columns))
 
     def __len__(self) -> int:
         return len(self.values)
