@@ -32,6 +32,11 @@ class GaussianSettings(Settings):
         default=0.3, ge=0, description="weight of the mean absolute depth error, per metre"
     )
 
+    sight_weight: float = Field(
+        default=0.0, ge=0,
+        description="weight, per metre, of how far what is drawn lies from the observed depth along the line of sight",
+    )
+
     # Optimisation (Adam)
     lr_means_m: float = Field(default=8e-4, ge=0, description="learning rate of the means, m")
     lr_log_scales: float = Field(default=0.03, ge=0, description="learning rate of the logarithmic scales")

@@ -3,7 +3,7 @@
 
 Backward walks front to back like forward and recomputes alpha, so nothing is stored per pixel: with S the
 part of <gradient, output> that lies behind the current primitive, dL/dalpha = T val - S / (1 - alpha),
-where val = <gradient, (colour, z, 1)>.
+where val = <gradient, (colour, z, 1, off)>, off = min(|z - seen|, SIGHT_LIMIT_M) the distance from an observed depth.
 
 A tile's pixels live in one flat float32 buffer that stays in the L1 cache, in groups of 8 neighbours of a row:
 group (strip, row) holds its planes one after the other, 8 floats each. A primitive walks only the rows and
@@ -28,10 +28,13 @@ F = np.float32
 _float, _vector, _i64 = FLOAT, VECTOR, ir.IntType(64)
 ZERO, HALF, ONE = F(0), F(0.5), F(1)
 ALPHA_MAX = 0.99
+# Farther than this from the observed depth a primitive costs no more: depth edges, and what glass lets through.
+SIGHT_LIMIT_M = 0.3
 STOP_EVERY = 16
 AHEAD = 4
-# Planes of a group, forward: transmittance, r, g, b, z; backward: transmittance, S, the five gradients.
-FORWARD_PLANES, BACKWARD_PLANES = 5, 7
+# Planes of a group, forward: transmittance, r, g, b, z, off, the observed depth; backward: transmittance, S, the
+# gradients of r, g, b, z, alpha and off, the observed depth.
+FORWARD_PLANES, BACKWARD_PLANES = 7, 9
 FORWARD_GROUP, BACKWARD_GROUP = FORWARD_PLANES * LANES, BACKWARD_PLANES * LANES
 # exp(-s) = poly(-s / 8)^8, fitted on [-0.72, 0], relative error 8e-7; s never exceeds ln 255 = 5.54.
 EXP_POLY = (0.00582640022, 0.0397533720, 0.165975796, 0.499888322, 0.999993988, 1.0)
@@ -105,6 +108,16 @@ class _Walk:
             totals = merged
         return totals
 
+    def off(self, z, seen):
+        """min(|z - seen|, SIGHT_LIMIT_M), and its derivative with respect to z."""
+        ln = self.lanes
+        zero, limit = ln.constant(0.0), ln.constant(SIGHT_LIMIT_M)
+        farther = ln.sub(z, seen)
+        distance = ln.where(">", farther, zero, farther, ln.sub(zero, farther))
+        side = ln.where(">", farther, zero, ln.constant(1.0), ln.constant(-1.0))
+        within = ln.where("<", distance, limit, distance, limit)
+        return within, ln.where("<", distance, limit, side, zero)
+
     def _falloff(self, s, o):
         """o exp(-s)."""
         ln = self.lanes
@@ -142,6 +155,8 @@ def _blend(typingctx, buf, r0, r1, u, v, hx, a, b, c, o, smax, cr, cg, cb, cz):
             ln.store(ln.sub(trans, weight), row_base, 0)
             for plane, channel in enumerate(colour, 1):
                 ln.store(ln.mul_add(weight, channel, ln.load(row_base, plane)), row_base, plane)
+            off, _ = walk.off(colour[3], ln.load(row_base, 6))
+            ln.store(ln.mul_add(weight, off, ln.load(row_base, 5)), row_base, 5)
             return []
 
         walk.strips((0, 0, None), body)
@@ -170,6 +185,10 @@ def _unblend(typingctx, buf, r0, r1, u, v, hx, a, b, c, o, smax, cr, cg, cb, cz,
             val = ln.load(row_base, 6)
             for g, channel in zip(grads, colour):
                 val = ln.mul_add(g, channel, val)
+            g_off = ln.load(row_base, 7)
+            off, slope = walk.off(colour[3], ln.load(row_base, 8))
+            val = ln.mul_add(g_off, off, val)
+            grads[3] = ln.mul_add(g_off, slope, grads[3])
             behind = ln.sub(ln.load(row_base, 1), ln.mul(weight, val))
             ln.store(behind, row_base, 1)
             ln.store(ln.sub(trans, weight), row_base, 0)
@@ -224,13 +243,15 @@ def _prefetch(typingctx, array, row):
 
 
 @njit(parallel=True, fastmath=True, cache=True)
-def forward(rec, entries, tile_start, tile_ids, bounds, tiles_x, t_stop, out, used):
+def forward(rec, entries, tile_start, tile_ids, bounds, tiles_x, t_stop, seen, out, used):
     """Blend the tiles `tile_ids`; thread part p owns tiles bounds[p] : bounds[p + 1].
 
-    `out` (5, H, W) receives r, g, b, sum w z, alpha; `used` how many entries of each tile counted before its
-    largest transmittance fell under `t_stop`. Tiles that are not listed keep what `out` held.
+    `out` (5, H, W) receives r, g, b, sum w z, alpha; with six planes also sum w min(|z - seen|, SIGHT_LIMIT_M) for the
+    observed depth `seen` (H, W). `used` receives how many entries of each tile counted before its largest transmittance
+    fell under `t_stop`. Tiles that are not listed keep what `out` held.
     """
     height, width = out.shape[1], out.shape[2]
+    observed = out.shape[0] == 6
     for part in prange(bounds.shape[0] - 1):
         buf = np.empty(STRIPS * TH * FORWARD_GROUP, np.float32)
         for slot in range(bounds[part], bounds[part + 1]):
@@ -241,7 +262,10 @@ def forward(rec, entries, tile_start, tile_ids, bounds, tiles_x, t_stop, out, us
             for j in range(h):
                 for i in range(w):
                     # Pixels outside the image stay opaque, so that they do not hold up the early stop.
-                    buf[((i // LANES) * TH + j) * FORWARD_GROUP + i % LANES] = ONE
+                    k = ((i // LANES) * TH + j) * FORWARD_GROUP + i % LANES
+                    buf[k] = ONE
+                    if observed:
+                        buf[k + 6 * LANES] = seen[y0 + j, x0 + i]
             start, stop = tile_start[slot], tile_start[slot + 1]
             count = 0
             fx0, fy0 = F(x0), F(y0)
@@ -273,15 +297,18 @@ def forward(rec, entries, tile_start, tile_ids, bounds, tiles_x, t_stop, out, us
                     out[2, y0 + j, x0 + i] = buf[k + 3 * LANES]
                     out[3, y0 + j, x0 + i] = buf[k + 4 * LANES]
                     out[4, y0 + j, x0 + i] = ONE - buf[k]
+                    if observed:
+                        out[5, y0 + j, x0 + i] = buf[k + 5 * LANES]
 
 
 @njit(parallel=True, fastmath=True, cache=True)
-def backward(rec, entries, tile_start, tile_ids, bounds, tiles_x, used, out, out_grad, entry_grad):
+def backward(rec, entries, tile_start, tile_ids, bounds, tiles_x, used, seen, out, out_grad, entry_grad):
     """Write the row of `entry_grad` (E, 12) of every entry of the drawn tiles; see `chain_rule` for its columns.
 
-    `out`, `out_grad` (5, H, W): forward's result and dL/dout.
+    `out`, `out_grad` (5 or 6, H, W): forward's result and dL/dout; `seen` as in `forward`.
     """
     height, width = out.shape[1], out.shape[2]
+    observed = out.shape[0] == 6
     for part in prange(bounds.shape[0] - 1):
         buf = np.empty(STRIPS * TH * BACKWARD_GROUP, np.float32)
         for slot in range(bounds[part], bounds[part + 1]):
@@ -293,10 +320,12 @@ def backward(rec, entries, tile_start, tile_ids, bounds, tiles_x, used, out, out
                 for i in range(w):
                     k = ((i // LANES) * TH + j) * BACKWARD_GROUP + i % LANES
                     total = ZERO
-                    for p in range(5):
+                    for p in range(out.shape[0]):
                         g = out_grad[p, y0 + j, x0 + i]
                         buf[k + (p + 2) * LANES] = g
                         total += g * out[p, y0 + j, x0 + i]
+                    if observed:
+                        buf[k + 8 * LANES] = seen[y0 + j, x0 + i]
                     buf[k], buf[k + LANES] = ONE, total
             start = tile_start[slot]
             stop = start + used[slot]

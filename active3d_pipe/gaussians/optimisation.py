@@ -37,12 +37,12 @@ def optimise_step(  # noqa: PLR0913 - the frame's arrays come one by one
         extra_gradient: (N, 14) float32 added to the gradient (E_geo, regularisers; see `sdf_coupling`).
 
     Returns:
-        {loss, l1, ssim, depth_l1 (m), psnr (dB), visible} of the frame before the step.
+        {loss, l1, ssim, depth_l1 (m), off_sight (m), psnr (dB), visible} of the frame before the step.
     """
     raster = RasterPass(
         dilation_px2=settings.dilation_px2, compensate=settings.opacity_compensation, workspace=params.workspace
     )
-    out = raster.forward(params.values.numpy(), camera, T_world_camera)
+    out = raster.forward(params.values.numpy(), camera, T_world_camera, seen=depth if settings.sight_weight else None)
     terms, out_grad = loss_gradient(out, rgb, depth, settings, params.workspace, mask)
     grad = raster.backward(out_grad)
     if extra_gradient is not None:

@@ -58,11 +58,14 @@ class RasterPass:
     _state: dict = field(default_factory=dict)
 
     def forward(
-        self, values: np.ndarray, camera: Camera, T_world_camera: np.ndarray, tiles: np.ndarray | None = None
+        self, values: np.ndarray, camera: Camera, T_world_camera: np.ndarray, tiles: np.ndarray | None = None,
+        seen: np.ndarray | None = None,
     ) -> np.ndarray:
         """Render `values` (N, 14) float32 (see kernels_projection); returns (5, H, W) r, g, b, sum w z, alpha.
 
         `tiles`: ids (row-major, `tile_grid`) of the tiles to draw, default all; pixels elsewhere are 0.
+        `seen`: observed depth (H, W) float32, m; with it a sixth plane is sum w min(|z - seen|, SIGHT_LIMIT_M), how far
+        what is drawn lies from there along the line of sight.
         """
         n, get = len(values), self.workspace.get
         grid = tile_grid(camera)
@@ -94,29 +97,30 @@ class RasterPass:
         entries = get("entries", (total, 2), np.int32)
         kernels_binning.fill_entries(order, m, box, grid[0], tile_slot, parts, places, first_entry, entries)
 
-        out = get("out", (5, camera.height, camera.width), np.float32)
+        out = get("out", (5 if seen is None else 6, camera.height, camera.width), np.float32)
+        observed = np.zeros((1, 1), np.float32) if seen is None else np.ascontiguousarray(seen, np.float32)
         if tiles is not None:
             out.fill(0)
         used = get("used", (len(tile_ids),), np.int64)
         bounds = _even_split(tile_start, parts)
         kernels_tiles.forward(
-            rec, entries, tile_start, tile_ids, bounds, grid[0], np.float32(self.t_stop), out, used
+            rec, entries, tile_start, tile_ids, bounds, grid[0], np.float32(self.t_stop), observed, out, used
         )
         self._state = {
             "values": values, "R": R, "t": t, "view": view, "rec": rec, "ids": ids, "counts": counts,
             "first_entry": first_entry, "entries": entries, "tile_start": tile_start, "tile_ids": tile_ids,
-            "bounds": bounds, "tiles_x": grid[0], "used": used, "out": out, "visible": m,
+            "bounds": bounds, "tiles_x": grid[0], "used": used, "seen": observed, "out": out, "visible": m,
         }
         return out
 
     def backward(self, out_grad: np.ndarray) -> np.ndarray:
-        """dL/dvalues (N, 14) float32 from dL/dout (5, H, W) of the last `forward`."""
+        """dL/dvalues (N, 14) float32 from dL/dout of the last `forward`, as many planes as it gave."""
         s = self._state
         n = len(s["values"])
         entry_grad = self.workspace.get("entry_grad", (len(s["entries"]), 12), np.float32)
         kernels_tiles.backward(
-            s["rec"], s["entries"], s["tile_start"], s["tile_ids"], s["bounds"], s["tiles_x"], s["used"], s["out"],
-            out_grad, entry_grad,
+            s["rec"], s["entries"], s["tile_start"], s["tile_ids"], s["bounds"], s["tiles_x"], s["used"], s["seen"],
+            s["out"], out_grad, entry_grad,
         )
         grad = self.workspace.get("grad", (n, 14), np.float32)
         kernels_projection.chain_rule(

@@ -15,11 +15,15 @@ from active3d_pipe.structures import Camera, GaussianModel, check_pose
 
 
 class Rendered(NamedTuple):
-    """What the rasteriser returns: rgb (H, W, 3); depth (H, W) = sum w z, m, not normalised; alpha (H, W)."""
+    """What the rasteriser returns: rgb (H, W, 3); depth (H, W) = sum w z, m, not normalised; alpha (H, W).
+
+    And `off_sight` (H, W) = sum w min(|z - seen|, limit), m, when an observed depth was given.
+    """
 
     rgb: Tensor
     depth: Tensor
     alpha: Tensor
+    off_sight: Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,16 +41,16 @@ class RenderedView:
 class _Rasterise(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, values: Tensor, camera: Camera, T: np.ndarray, tiles: np.ndarray | None, settings: GaussianSettings
+        ctx: Any, values: Tensor, camera: Camera, T: np.ndarray, settings: GaussianSettings, *images: Any
     ) -> Tensor:
         # Own buffers: several rendered images may wait for their backward at the same time.
         ctx.raster_pass = new_pass(settings)
-        return torch.from_numpy(ctx.raster_pass.forward(values.numpy(), camera, T, tiles))
+        return torch.from_numpy(ctx.raster_pass.forward(values.numpy(), camera, T, *images))
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         grad = ctx.raster_pass.backward(np.ascontiguousarray(grads[0].numpy(), dtype=np.float32))
-        return torch.from_numpy(grad), None, None, None, None
+        return torch.from_numpy(grad), None, None, None, None, None
 
 
 def new_pass(settings: GaussianSettings) -> RasterPass:
@@ -61,6 +65,7 @@ def render(
     *,
     tiles: np.ndarray | None = None,
     settings: GaussianSettings | None = None,
+    seen: np.ndarray | None = None,
 ) -> Rendered:
     """Differentiable view of the Gaussians, float32, black background.
 
@@ -70,13 +75,14 @@ def render(
         camera, T_world_camera: intrinsics and pose; poses take no gradient.
         tiles: ids of the tiles to draw (`raster_pass.tile_grid`), default all; other pixels are 0.
         settings: dilation and opacity compensation, default `GaussianSettings()`.
+        seen: observed depth (H, W) float32, m, for `off_sight`.
     """
     values = params.values if isinstance(params, GaussianParameters) else params
     if values.ndim != 2 or values.shape[1] != 14 or values.dtype != torch.float32:
         raise InputError(f"render: values are {tuple(values.shape)} {values.dtype}, expected (N, 14) float32")
     T = check_pose(T_world_camera, "render: T_world_camera")
-    image = _Rasterise.apply(values.contiguous(), camera, T, tiles, settings or GaussianSettings())
-    return Rendered(image[:3].permute(1, 2, 0), image[3], image[4])
+    image = _Rasterise.apply(values.contiguous(), camera, T, settings or GaussianSettings(), tiles, seen)
+    return Rendered(image[:3].permute(1, 2, 0), image[3], image[4], None if seen is None else image[5])
 
 
 def render_view(

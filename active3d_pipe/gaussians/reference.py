@@ -12,6 +12,7 @@ from active3d_pipe.structures import Camera
 
 ALPHA_MAX = 0.99
 ALPHA_MIN = 1 / 255
+SIGHT_LIMIT_M = 0.3
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
@@ -34,11 +35,13 @@ def render_reference(
     compensate: bool = True,
     near_m: float = 0.05,
     frustum_clamp: float = 1.3,
+    seen: np.ndarray | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Blend all Gaussians `values` (N, 14) (columns as in kernels_projection) front to back.
 
     Returns:
-        (5, H, W) r, g, b, sum w z, alpha; and (H, W) bool, the pixels near a discontinuity of the model (a
+        (5, H, W) r, g, b, sum w z, alpha, with an observed depth `seen` (H, W) also a sixth plane, sum w
+        min(|z - seen|, SIGHT_LIMIT_M); and (H, W) bool, the pixels near a discontinuity of the model (a
         primitive's alpha about 1/255 or 0.99, two depths about equal), where float32 may fall on the other side.
     """
     T = torch.as_tensor(se3.inverse(T_world_camera), dtype=values.dtype)
@@ -75,6 +78,9 @@ def render_reference(
     weight = alpha * behind[:-1]
     channels = torch.cat([values[:, 11:14], z[:, None], torch.ones_like(z)[:, None]], 1)
     image = torch.einsum("nhw,nc->chw", weight, channels)
+    if seen is not None:
+        off = (z[:, None, None] - torch.as_tensor(seen, dtype=values.dtype)).abs().clamp_max(SIGHT_LIMIT_M)
+        image = torch.cat([image, (weight * off).sum(0, keepdim=True)])
 
     near_step = ((raw / ALPHA_MIN - 1).abs() < 1e-3) | ((raw / ALPHA_MAX - 1).abs() < 1e-4)
     doubtful = near_step.any(0)

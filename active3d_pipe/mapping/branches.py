@@ -14,6 +14,7 @@ from active3d_pipe.field.optimise import field_step
 from active3d_pipe.field.rays import sample_rays
 from active3d_pipe.field.sdf_field import SdfField
 from active3d_pipe.field.tsdf import TsdfField
+from active3d_pipe.gaussians.config import GaussianSettings
 from active3d_pipe.gaussians.optimisation import optimise_step
 from active3d_pipe.gaussians.pruning import prune_mask
 from active3d_pipe.gaussians.sdf_coupling import sdf_gradient
@@ -76,13 +77,17 @@ def seed(hybrid: HybridMap, frame: Frame, rng: np.random.Generator, clock: Clock
 
 
 def train_gaussians(
-    hybrid: HybridMap, seen: Target, rate: float, clock: Clock, coupling: np.ndarray | None = None
+    hybrid: HybridMap, seen: Target, rate: float, clock: Clock, coupling: np.ndarray | None = None,
+    settings: GaussianSettings | None = None,
 ) -> dict[str, float]:
-    """One iteration of E_photo and depth on one image; `coupling` is the gradient of E_geo, see `coupling_gradient`."""
+    """One iteration of E_photo and depth on one image; `coupling` is the gradient of E_geo, see `coupling_gradient`.
+
+    `settings`: other loss weights than the map's own.
+    """
     with clock.of("gaussians"):
         return optimise_step(
-            hybrid.gaussians, seen.camera, seen.T_world_camera, seen.rgb, seen.depth, hybrid.settings.gaussians, rate,
-            extra_gradient=coupling,
+            hybrid.gaussians, seen.camera, seen.T_world_camera, seen.rgb, seen.depth,
+            settings or hybrid.settings.gaussians, rate, extra_gradient=coupling,
         )
 
 

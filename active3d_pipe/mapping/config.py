@@ -76,6 +76,9 @@ class MappingSettings(Settings):
     refinement_balance: float = Field(
         0.5, ge=0, description="visits of the refinement to a frame go with this power of its exposure (frame_order)"
     )
+    refinement_sight_weight: float = Field(
+        1.0, ge=0, description="`gaussians.sight_weight` of the refinement: primitives gather at the observed depth"
+    )
     refinement_field_iterations: int = Field(400, ge=0, description="annealed field iterations, in export")
     field: FieldSettings = Field(default_factory=FieldSettings, description="implicit branch")
     tsdf: TsdfSettings = Field(default_factory=TsdfSettings, description="implicit branch, with geometry tsdf")

@@ -40,6 +40,7 @@ def refine(
     growth = limit - len(hybrid.gaussians)
     quota = max(1, int(growth / max(total * ADD_UNTIL / ADD_EVERY, 1))) if growth > 0 else 0
     coupled = settings.representation == "hybrid"
+    weights = settings.gaussians.model_copy(update={"sight_weight": settings.refinement_sight_weight})
     scores: list[float] = []
     order = visiting_order(exposure(frames, rng) ** settings.refinement_balance, total, rng) if total else ()
     for i, visited in enumerate(order):
@@ -49,7 +50,7 @@ def refine(
         pull = None
         if coupled and i % settings.coupling_every == settings.coupling_every - 1:
             pull = branches.coupling_gradient(hybrid, rng, clock)
-        terms = branches.train_gaussians(hybrid, branches.target(frame), annealed(i, total), clock, pull)
+        terms = branches.train_gaussians(hybrid, branches.target(frame), annealed(i, total), clock, pull, weights)
         if not np.isfinite(terms["loss"]):
             raise NumericalError(f"refinement: the loss is not finite in iteration {i}; lower the learning rates")
         scores.append(terms["psnr"])

@@ -76,26 +76,30 @@ def torch_loss(
     valid = m & (d > 0)
     w = settings.ssim_weight
     color = (x - y).abs().sum() / (3 * m.sum())
-    return (1 - w) * color + w * (1 - torch_ssim(x, y)) + settings.depth_weight * (image[3] - d)[valid].abs().mean()
+    loss = (1 - w) * color + w * (1 - torch_ssim(x, y)) + settings.depth_weight * (image[3] - d)[valid].abs().mean()
+    return loss + settings.sight_weight * image[5][valid].mean() if len(image) == 6 else loss
 
 
+@pytest.mark.parametrize("sight", [False, True])
 @pytest.mark.parametrize("masked", [False, True])
-def test_frame_loss_matches_torch(masked: bool) -> None:
+def test_frame_loss_matches_torch(masked: bool, sight: bool) -> None:
     rng = np.random.default_rng(3)
     x, rgb = image_pair(33, 45, 1)
     depth = rng.uniform(1, 3, (33, 45)).astype(np.float32)
     depth[rng.random(depth.shape) < 0.2] = 0
     mask = rng.random(depth.shape) < 0.8 if masked else np.ones(depth.shape, bool)
     z = (depth + rng.normal(size=depth.shape) * 0.2).astype(np.float32)
-    settings = GaussianSettings(ssim_weight=0.3, depth_weight=0.7)
+    settings = GaussianSettings(ssim_weight=0.3, depth_weight=0.7, sight_weight=1.7)
     planes = np.concatenate([x.transpose(2, 0, 1), z[None], np.ones_like(z)[None]])
+    if sight:
+        planes = np.concatenate([planes, rng.uniform(0, 0.3, (1, *z.shape)).astype(np.float32)])
 
     exact = torch.from_numpy(planes.astype(np.float64)).requires_grad_()
     wanted = torch_loss(exact, rgb, depth, settings, mask)
     wanted.backward()
 
     leaf = torch.from_numpy(planes.copy()).requires_grad_()
-    rendered = Rendered(leaf[:3].permute(1, 2, 0), leaf[3], leaf[4])
+    rendered = Rendered(leaf[:3].permute(1, 2, 0), leaf[3], leaf[4], leaf[5] if sight else None)
     loss, terms = frame_loss(rendered, rgb, depth, settings, mask if masked else None)
     loss.backward()
     assert float(loss.detach()) == pytest.approx(float(wanted.detach()), rel=1e-5)

@@ -36,12 +36,15 @@ def tilted_pose(seed: int) -> np.ndarray:
     return se3.look_at(rng.normal(size=3) * 0.1, rng.normal(size=3) * 0.2 + [0, 0, 3], up=[0.1, -1, 0.0])
 
 
-def compare(values: np.ndarray, camera: Camera, T: np.ndarray, **options: float) -> dict[str, float]:
+def compare(
+    values: np.ndarray, camera: Camera, T: np.ndarray, seen: np.ndarray | None = None, **options: float
+) -> dict[str, float]:
     """Largest image error and relative L2 gradient errors, doubtful pixels (see the reference) left out."""
     raster = RasterPass(t_stop=0.0, **options)
-    out = raster.forward(values, camera, T)
+    out = raster.forward(values, camera, T, seen=seen)
     exact = torch.from_numpy(values.astype(np.float64)).requires_grad_()
-    image, doubtful = render_reference(exact, camera, T, **options)
+    image, doubtful = render_reference(exact, camera, T, seen=seen, **options)
+    assert out.shape == tuple(image.shape)
     clear = ~doubtful.numpy()
     out_grad = np.random.default_rng(1).normal(size=out.shape).astype(np.float32) * clear
     (image * torch.from_numpy(out_grad.astype(np.float64))).sum().backward()
@@ -63,6 +66,25 @@ def test_matches_the_reference(compensate: bool, dilation_px2: float, size: tupl
     assert errors["image"] < 3e-5
     for name in COLUMNS:
         assert errors[name] < 5e-5, (name, errors)
+
+
+@pytest.mark.parametrize("compensate", [True, False])
+def test_distance_from_the_observed_depth_matches_the_reference(compensate: bool) -> None:
+    """Observations near what is drawn and far from it, so that both sides of the limit count."""
+    camera = Camera(83, 61, 60.0, 58.0, 40.0, 31.5)
+    values = random_values(400, 3)
+    seen = np.random.default_rng(4).uniform(0.3, 3.5, (61, 83)).astype(np.float32)
+    errors = compare(values, camera, tilted_pose(0), seen, compensate=compensate)
+    assert errors["clear"] > 0.5
+    assert errors["image"] < 3e-5
+    for name in COLUMNS:
+        assert errors[name] < 5e-5, (name, errors)
+    plain, out = RasterPass(), RasterPass()
+    image = out.forward(values, camera, tilted_pose(0), seen=seen)
+    assert np.array_equal(plain.forward(values, camera, tilted_pose(0)), image[:5])
+    grad = np.random.default_rng(1).normal(size=(6, 61, 83)).astype(np.float32)
+    grad[5] = 0
+    np.testing.assert_allclose(out.backward(grad), plain.backward(grad[:5].copy()), rtol=1e-5, atol=1e-5)
 
 
 def test_disc_seen_edge_on_has_finite_matching_gradients() -> None:
