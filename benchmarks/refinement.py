@@ -31,7 +31,7 @@ def judged(hybrid: HybridMap, views: list[Frame]) -> list[str]:
     for frame in views:
         shown = hybrid.render(frame.camera, frame.T_world_camera)
         image, truth, valid = np.clip(shown.rgb, 0, 1), unit_rgb(frame), frame.depth > 0
-        off = np.abs(shown.depth / np.maximum(shown.alpha, 1e-3) - frame.depth)[valid]
+        off = np.abs(shown.depth - frame.depth)[valid]
         rows.append((psnr(image, truth), ssim(image, truth), off.mean(), np.median(off), np.mean(off > 0.05)))
     mean, worst = np.mean(rows, axis=0), np.percentile([row[0] for row in rows], 10)
     return [
