@@ -14,6 +14,8 @@ from active3d_pipe.structures.uncertainty_volume import UncertaintyVolume
 from active3d_pipe.structures.voxel_grid import VoxelGrid
 
 UNREACHABLE = 1e29
+# Bits of the half-size cells (4 a + 2 b + c) in the lower and the upper half of a voxel, along x, y, z.
+HALVES = ((0x0F, 0xF0), (0x33, 0xCC), (0x55, 0xAA))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,8 +94,25 @@ def known_free(
     """
     free, hit = volume["free_evidence"], volume["hit_evidence"]
     out = (free >= settings.min_free_rays) & (occupancy <= settings.max_free_occupancy) & (hit < 2 + 0.02 * free)
+    drop_half_seen(out, volume["cells_passed"].astype(np.uint8))
     mark_body(out, volume.grid, walked, radius_m)
     return out
+
+
+def drop_half_seen(free: np.ndarray, passed: np.ndarray) -> None:
+    """Take from `free` the voxels whose half towards a neighbour that is not free was passed by no ray, in place.
+
+    Rays along a wall pass the near half of its voxels and may end in none: such a voxel seems free with a wall in its
+    middle. `passed`: uint8 bits of the half-size cells [X, Y, Z]; a volume without any is left alone.
+    """
+    if not passed.any():
+        return
+    blocked = ~free
+    for axis, (lower, upper) in enumerate(HALVES):
+        near, far = (np.moveaxis(a, axis, 0) for a in (free, passed))
+        beside = np.moveaxis(blocked, axis, 0)
+        near[1:] &= ~(beside[:-1] & (far[1:] & lower == 0))
+        near[:-1] &= ~(beside[1:] & (far[:-1] & upper == 0))
 
 
 def mark_body(free: np.ndarray, grid: VoxelGrid, centres_world: np.ndarray, radius_m: float) -> None:

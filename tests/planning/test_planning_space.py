@@ -1,3 +1,4 @@
+from dataclasses import replace
 from itertools import product
 
 import box_world
@@ -10,7 +11,7 @@ from scipy.sparse.csgraph import dijkstra
 from active3d_pipe.geometry import se3
 from active3d_pipe.planning.candidates import coarse_positions, fine_positions, view_directions
 from active3d_pipe.planning.config import PlanningSettings
-from active3d_pipe.planning.free_space import build_free_space, clearance, mark_body
+from active3d_pipe.planning.free_space import build_free_space, clearance, drop_half_seen, known_free, mark_body
 from active3d_pipe.planning.kernels_candidates import best_of_blocks, spread_values
 from active3d_pipe.planning.kernels_distance import geodesic, open_moves
 from active3d_pipe.planning.risk_field import joint_occupancy
@@ -131,6 +132,46 @@ def test_moves_and_geodesic_costs_equal_the_slow_ones(planar, share):
             assert cost[v] == pytest.approx(cost[before] + length, rel=1e-5)
     near = geodesic(moves, rate, np.array(start), np.float32(0.1), np.float32(0.3))[0]
     assert (near[cost <= 0.3] == cost[cost <= 0.3]).all()
+
+
+def test_voxels_that_rays_passed_in_the_half_away_from_a_wall_only_are_not_free():
+    rng = np.random.default_rng(0)
+    free = rng.random((6, 5, 4)) < 0.7
+    passed = rng.integers(0, 256, free.shape).astype(np.uint8)
+    passed[rng.random(free.shape) < 0.4] &= 0x33
+    want = free.copy()
+    for v in np.argwhere(free):
+        for axis, upper in product(range(3), (0, 1)):
+            beside = v.copy()
+            beside[axis] += 2 * upper - 1
+            if not 0 <= beside[axis] < free.shape[axis] or free[tuple(beside)]:
+                continue
+            cells = [c for c in range(8) if (c >> (2 - axis) & 1) == upper]
+            if not any(passed[tuple(v)] >> c & 1 for c in cells):
+                want[tuple(v)] = False
+    got = free.copy()
+    drop_half_seen(got, passed)
+    assert (got == want).all() and 0 < (free & ~want).sum() < free.sum() / 2
+    untouched = free.copy()
+    drop_half_seen(untouched, np.zeros_like(passed))
+    assert (untouched == free).all()
+
+
+def test_a_wall_in_the_middle_of_voxels_that_no_ray_ended_in_is_no_free_space(seen):
+    """Rays that ran along it passed its voxels' near half: the clearance in front of it must not count that half."""
+    _, volume, _, walked = seen
+    passable = known_free(volume, volume["occupancy"], walked, 0.01, SETTINGS)
+    i, j, k = np.argwhere(passable[1:-1, 1:-1, 1:-1])[0] + 1
+    free, hit = volume["free_evidence"].copy(), volume["hit_evidence"].copy()
+    occupancy, passed = volume["occupancy"].copy(), volume["cells_passed"].copy()
+    free[i, j - 1, k], hit[i, j - 1, k], occupancy[i, j - 1, k] = 0, 0, 0.5
+    free[i, j, k], hit[i, j, k], occupancy[i, j, k], passed[i, j, k] = 18, 0, 0.001, 0xCC
+    changed = {"free_evidence": free, "hit_evidence": hit, "occupancy": occupancy, "cells_passed": passed}
+    grazed = replace(volume, arrays={**volume.arrays, **changed})
+    away = np.array([[1e3, 1e3, 1e3]])
+    assert not known_free(grazed, occupancy, away, 0.01, SETTINGS)[i, j, k]
+    passed[i, j, k] = 0xFF
+    assert known_free(grazed, occupancy, away, 0.01, SETTINGS)[i, j, k]
 
 
 def test_risk_is_one_at_the_body_zero_in_the_open_and_never_rises_with_clearance(seen):
