@@ -31,7 +31,6 @@ class GaussianSettings(Settings):
     depth_weight: float = Field(
         default=0.3, ge=0, description="weight of the mean absolute depth error, per metre"
     )
-
     sight_weight: float = Field(
         default=0.0, ge=0,
         description="weight, per metre, of how far what is drawn lies from the observed depth along the line of sight",

@@ -90,7 +90,8 @@ def known_free(
 ) -> np.ndarray:
     """(X, Y, Z) bool, voxels known to be free: rays passed them, none of weight ended in them, O is low.
 
-    The agent's body is a sensor too: a sphere around every pose it stood at is free.
+    Beside what is not free both halves of a voxel must have been passed (`drop_half_seen`). The agent's body is a
+    sensor too: a sphere around every pose it stood at is free.
     """
     free, hit = volume["free_evidence"], volume["hit_evidence"]
     out = (free >= settings.min_free_rays) & (occupancy <= settings.max_free_occupancy) & (hit < 2 + 0.02 * free)
@@ -109,10 +110,9 @@ def drop_half_seen(free: np.ndarray, passed: np.ndarray) -> None:
         return
     blocked = ~free
     for axis, (lower, upper) in enumerate(HALVES):
-        near, far = (np.moveaxis(a, axis, 0) for a in (free, passed))
-        beside = np.moveaxis(blocked, axis, 0)
-        near[1:] &= ~(beside[:-1] & (far[1:] & lower == 0))
-        near[:-1] &= ~(beside[1:] & (far[:-1] & upper == 0))
+        kept, beside, cells = (np.moveaxis(a, axis, 0) for a in (free, blocked, passed))
+        kept[1:] &= ~(beside[:-1] & (cells[1:] & lower == 0))
+        kept[:-1] &= ~(beside[1:] & (cells[:-1] & upper == 0))
 
 
 def mark_body(free: np.ndarray, grid: VoxelGrid, centres_world: np.ndarray, radius_m: float) -> None:

@@ -221,6 +221,7 @@ def _mark_vain(depth, camera, pose, reach, start, stride, grid, range_m, blocked
     origin, inv_voxel = grid
     # Lost rays end at depth `range_m`: of the others no more is needed than the voxels that reach so near.
     longest = min(far, range_m + 2.0 / inv_voxel)
+    shape, flat_blocked = blocked.shape, blocked.ravel()
     ox, oy, oz = _pixel_end(0, 0, 0.0, camera, pose, origin, inv_voxel)
     for lost in range(2):
         for i in range(start[0], depth.shape[0], stride):
@@ -231,9 +232,9 @@ def _mark_vain(depth, camera, pose, reach, start, stride, grid, range_m, blocked
                 end = range_m if lost else min(d, longest)
                 ex, ey, ez = _pixel_end(i, j, end, camera, pose, origin, inv_voxel)
                 if lost:
-                    _mark_lost(ox, oy, oz, ex, ey, ez, blocked.shape, blocked.ravel(), stamp, frame_id, vain)
+                    _mark_lost(ox, oy, oz, ex, ey, ez, shape, flat_blocked, stamp, frame_id, vain)
                 else:
-                    _stamp_path(ox, oy, oz, ex, ey, ez, blocked.shape, stamp, frame_id)
+                    _stamp_path(ox, oy, oz, ex, ey, ez, shape, stamp, frame_id)
 
 
 @njit(parallel=True, cache=True)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 from uncertainty_room import CAMERA, frame, frames, pose, residual, room_grid
 
 from active3d_pipe.errors import InputError
@@ -9,7 +10,9 @@ from active3d_pipe.geometry import projection
 from active3d_pipe.structures import Camera
 from active3d_pipe.uncertainty.config import UncertaintySettings
 from active3d_pipe.uncertainty.explicit import (
+    MIN_VIEWS,
     MIN_WEIGHT,
+    ViewResidual,
     backproject,
     explicit_uncertainty,
     most_uncertain,
@@ -146,6 +149,26 @@ def test_blurred_residuals_keep_their_mean_and_reach_the_neighbours():
     assert (blurred > 0).sum() > (sharp > 0).sum()
     assert ((blurred > 0) | (sharp == 0)).all()
     np.testing.assert_allclose(blurred[blurred > 0], level, atol=1e-3)
+
+
+def test_views_without_a_reading_change_nothing():
+    nothing = np.zeros((CAMERA.height, CAMERA.width), np.float32)
+    grid, blind = room_grid(0.19), ViewResidual(CAMERA, pose(0.0, (0.9, 1.1, 1.2)), nothing, nothing, nothing)
+    before = np.random.default_rng(0).random(grid.shape).astype(np.float32)
+    np.testing.assert_array_equal(explicit_uncertainty(grid, [blind], before, S), before)
+
+
+def test_the_blur_reaches_no_farther_than_the_box_that_it_is_done_in():
+    """The values are those of a blur of the whole volume."""
+    grid = room_grid(0.09)
+    view = varied(frame(0, pose(17.0, (0.93, 1.12, 1.23))), 3)
+    found, coverage = backproject(grid, [view], S)
+    total, count = (
+        gaussian_filter(a, S.residual_blur_voxels, mode="constant", truncate=2.0) for a in (found * coverage, coverage)
+    )
+    want = np.where(count > MIN_VIEWS, total / np.maximum(count, MIN_VIEWS), 0)
+    np.testing.assert_array_equal(explicit_uncertainty(grid, [view], None, S), want)
+    assert 0.05 < (want > 0).mean() < 0.8
 
 
 def test_malformed_views_are_refused():
