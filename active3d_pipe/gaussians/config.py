@@ -38,10 +38,10 @@ class GaussianSettings(Settings):
 
     # Optimisation (Adam)
     lr_means_m: float = Field(default=8e-4, ge=0, description="learning rate of the means, m")
-    lr_log_scales: float = Field(default=0.03, ge=0, description="learning rate of the logarithmic scales")
+    lr_log_scales: float = Field(default=0.05, ge=0, description="learning rate of the logarithmic scales")
     lr_quats: float = Field(default=8e-3, ge=0, description="learning rate of the quaternions")
     lr_opacity_logits: float = Field(default=0.05, ge=0, description="learning rate of the opacity logits")
-    lr_colors: float = Field(default=0.02, ge=0, description="learning rate of the colours")
+    lr_colors: float = Field(default=0.005, ge=0, description="learning rate of the colours")
     adam_beta1: float = Field(default=0.9, ge=0, lt=1, description="decay of Adam's first moment")
     adam_beta2: float = Field(default=0.999, ge=0, lt=1, description="decay of Adam's second moment")
     visible_only: bool = Field(
