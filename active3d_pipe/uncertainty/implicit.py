@@ -64,8 +64,9 @@ def implicit_occupancy(
 # Integral of H[Phi(z)] from 0 to z: the entropy of a sign whose mean lies z standard deviations from zero.
 _Z = np.linspace(-8, 8, 4097)
 _H = bernoulli_entropy(ndtr(_Z))
-_INTEGRAL = np.concatenate([[0], np.cumsum((_H[1:] + _H[:-1]) / 2 * np.diff(_Z))])
-_INTEGRAL = _INTEGRAL - _INTEGRAL[len(_Z) // 2]
+ENTROPY_INTEGRAL = np.concatenate([[0], np.cumsum((_H[1:] + _H[:-1]) / 2 * np.diff(_Z))])
+ENTROPY_INTEGRAL = ENTROPY_INTEGRAL - ENTROPY_INTEGRAL[len(_Z) // 2]
+ENTROPY_REACH = float(_Z[-1])
 
 
 def implicit_entropy(
@@ -82,6 +83,6 @@ def implicit_entropy(
     scale = np.maximum(sigma, np.float32(settings.sigma_floor_m))
     h = np.empty(sdf.shape, np.float32)
     low, high = ((sdf + sign * support) / scale for sign in (np.float32(-1), np.float32(1)))
-    kernels.mean_between(low.ravel(), high.ravel(), _INTEGRAL, _Z[-1], h.reshape(-1))
+    kernels.mean_between(low.ravel(), high.ravel(), ENTROPY_INTEGRAL, ENTROPY_REACH, h.reshape(-1))
     np.clip(h, 0, 1, out=h)
     return (1 - observed * (1 - h)).astype(np.float32)

@@ -3,20 +3,17 @@
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.ndimage import maximum_filter, minimum_filter
-from scipy.special import expit
+from scipy.ndimage import maximum_filter
 
 from active3d_pipe.errors import InputError, NumericalError
-from active3d_pipe.information.entropy import bernoulli_entropy
 from active3d_pipe.information.gain import entropy_drop
 from active3d_pipe.structures import Frame, GaussianModel, UncertaintyVolume, VoxelGrid
-from active3d_pipe.uncertainty import explicit, fusion, implicit, occupancy, temporal
+from active3d_pipe.uncertainty import explicit, fusion, occupancy
 from active3d_pipe.uncertainty.carving import RayEvidence, integrate_depth, looks_in_vain
 from active3d_pipe.uncertainty.config import UncertaintySettings
 from active3d_pipe.uncertainty.explicit import ViewResidual
+from active3d_pipe.uncertainty.terms import open_to_the_field, voxel_terms
 
-# Attention below which what the field says of a voxel counts for nothing.
-MASKED = 0.02
 FieldQuery = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
@@ -63,34 +60,18 @@ def compute_volume(  # noqa: PLR0913  (the inputs of the stage, by name)
     fresh = integrate_depth(grid, new_frames, settings)
     evidence = before.joined(fresh)
 
-    not_free = occupancy.attention(evidence, settings)
-    sdf, sigma = _query(grid, field_query, previous, open_to_the_field(evidence, not_free))
-    observed = occupancy.observation(evidence, settings)
+    geometry = _query(grid, field_query, previous, open_to_the_field(evidence, settings))
     vain = looks_in_vain(grid, new_frames, evidence.hit > 0, settings)
     if previous is not None:
         vain = vain + previous["vain_looks"]
-    open_share = occupancy.resolvable(vain, observed, settings)
-    attention = open_share * not_free
-    support = implicit.cube_support(sdf, grid.voxel_size)
-    p_imp = implicit.implicit_occupancy(sdf, sigma, observed, support, settings)
-    log_odds = occupancy.explicit_log_odds(evidence, occupancy.opacity_mass(grid, gaussians), settings)
-    entropy_imp = attention * implicit.implicit_entropy(sdf, sigma, observed, support, settings)
-    entropy_exp = open_share * bernoulli_entropy(expit(log_odds))
+    mass = occupancy.opacity_mass(grid, gaussians)
+    terms = voxel_terms(evidence, fresh, vain, mass, geometry, previous, settings, grid.voxel_size)
 
-    known = implicit.knowledge(observed, evidence.hit, settings)
-    u_imp = attention * implicit.implicit_uncertainty(sigma, known, settings)
     last_u_exp = None if previous is None else previous["u_exp"]
     # Residuals lie at observed depths, never at phantoms, and their trilinear weights reach the voxels beside a
     # surface, which may prove to hold it; only what lies in the midst of free space is forgotten.
-    near = maximum_filter(attention, size=3, mode="nearest")
+    near = maximum_filter(terms.attention, size=3, mode="nearest")
     u_exp = near * explicit.explicit_uncertainty(grid, views, last_u_exp, settings)
-    u_time = np.zeros(grid.shape, np.float32)
-    if previous is not None:
-        # What the field does in space known to be free is a phantom, unless this round's rays found it otherwise;
-        # space that was not known to be free before the round, and is now, is news.
-        found = np.where(fresh.free + fresh.hit > 0, occupancy.attention(fresh, settings), 0)
-        relevant = observed * np.maximum(found, occupancy.attention(before, settings))
-        u_time = temporal.temporal_uncertainty(sdf, previous["sdf"], previous["u_time"], relevant, settings)
 
     rows, targets = revealed_rows(grid, previous, fresh, predicted, settings)
     statistics = _statistics_of(previous).updated(rows, targets, settings.forgetting)
@@ -98,15 +79,16 @@ def compute_volume(  # noqa: PLR0913  (the inputs of the stage, by name)
     a = fused.alphas.astype(np.float32)
 
     arrays = {
-        "u_imp": u_imp,
+        "u_imp": terms.u_imp,
         "u_exp": u_exp,
-        "u_time": u_time,
-        "u_final": a[0] * u_imp + a[1] * u_exp + a[2] * u_time,
-        "occupancy": occupancy.hybrid_occupancy(log_odds, p_imp, evidence, settings),
-        "entropy_imp": entropy_imp,
-        "entropy_exp": entropy_exp,
-        "entropy": np.float32(settings.lambda_imp) * entropy_imp + np.float32(settings.lambda_exp) * entropy_exp,
-        "sdf": sdf,
+        "u_time": terms.u_time,
+        "u_final": a[0] * terms.u_imp + a[1] * u_exp + a[2] * terms.u_time,
+        "occupancy": terms.occupancy,
+        "entropy_imp": terms.entropy_imp,
+        "entropy_exp": terms.entropy_exp,
+        "entropy": np.float32(settings.lambda_imp) * terms.entropy_imp
+        + np.float32(settings.lambda_exp) * terms.entropy_exp,
+        "sdf": geometry[0],
         "free_evidence": evidence.free,
         "hit_evidence": evidence.hit,
         "view_quality": evidence.quality,
@@ -134,18 +116,6 @@ def revealed_rows(
     revealed = (fresh.hit > 0) & (coverage > 0)
     rows = np.stack([previous[f"u_{name}"][revealed] for name in fusion.TERMS], axis=-1)
     return rows, residual[revealed]
-
-
-def open_to_the_field(evidence: RayEvidence, not_free: np.ndarray) -> np.ndarray:
-    """(X, Y, Z) bool, voxels of which the field's opinion matters: some two thirds of a volume may go without.
-
-    Where no ray went, nothing that is computed depends on it; in space that rays surely found free it is masked. The
-    voxels next to all others are asked too, for the gradient of the SDF. `not_free` is `occupancy.attention`.
-    """
-    unseen = (evidence.free + evidence.hit == 0).view(np.uint8)
-    surely_free = (not_free < MASKED).view(np.uint8)
-    settled = [minimum_filter(a, size=3, mode="nearest") for a in (unseen, surely_free)]
-    return (settled[0] | settled[1]) == 0
 
 
 def _query(

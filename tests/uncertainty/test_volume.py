@@ -19,6 +19,7 @@ from active3d_pipe.geometry import projection
 from active3d_pipe.structures import VOLUMES, GaussianModel, VoxelGrid
 from active3d_pipe.uncertainty import volume as volume_module
 from active3d_pipe.uncertainty.config import UncertaintySettings
+from active3d_pipe.uncertainty.terms import MASKED
 from active3d_pipe.uncertainty.volume import compute_volume, make_grid
 
 GRID = room_grid()
@@ -104,7 +105,7 @@ def test_the_field_is_asked_only_where_its_answer_matters(seen):
         full = volume(again, seen)
     for name in VOLUMES:
         if name != "sdf":
-            np.testing.assert_allclose(plain[name], full[name], atol=module.MASKED, err_msg=name)
+            np.testing.assert_allclose(plain[name], full[name], atol=MASKED, err_msg=name)
 
 
 def test_seen_surface_is_occupied_and_sure(seen):
