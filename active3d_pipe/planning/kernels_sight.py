@@ -142,6 +142,16 @@ def cell_share(t, enough, quality_range):
     return min(ONE, quality_range / (max(t, np.float32(1e-3)) * enough))
 
 
+def _unit_offsets():
+    """Unit vectors to the voxels of a block of 5 x 5 x 5 from the one in the middle, float32 [5, 5, 5, 3]."""
+    offsets = np.stack(np.meshgrid(*[np.arange(-2, 3, dtype=np.float32)] * 3, indexing="ij"), axis=-1)
+    length = np.sqrt((offsets * offsets).sum(axis=-1, keepdims=True))
+    return offsets / np.maximum(length, ONE)
+
+
+UNIT_OFFSETS = _unit_offsets()
+
+
 @njit(parallel=True, cache=True)
 def surface_normals(kind, out):
     """Direction from each surface voxel towards its seen-free neighbours, components * 127, int8 [X, Y, Z, 3]."""
@@ -151,16 +161,14 @@ def surface_normals(kind, out):
             for k in range(nz):
                 if kind[i, j, k] != 2:
                     continue
-                x = y = z = np.float32(0.0)
+                x = y = z = ZERO
                 for a in range(max(0, i - 2), min(nx, i + 3)):
                     for b in range(max(0, j - 2), min(ny, j + 3)):
                         for c in range(max(0, k - 2), min(nz, k + 3)):
                             if kind[a, b, c] == 0:
-                                u, v, w = np.float32(a - i), np.float32(b - j), np.float32(c - k)
-                                n = np.sqrt(u * u + v * v + w * w)
-                                x += u / n
-                                y += v / n
-                                z += w / n
+                                x += UNIT_OFFSETS[a - i + 2, b - j + 2, c - k + 2, 0]
+                                y += UNIT_OFFSETS[a - i + 2, b - j + 2, c - k + 2, 1]
+                                z += UNIT_OFFSETS[a - i + 2, b - j + 2, c - k + 2, 2]
                 n = np.sqrt(x * x + y * y + z * z)
                 if n > np.float32(1e-3):
                     out[i, j, k, 0] = np.int8(np.round(np.float32(127) * x / n))
