@@ -23,6 +23,7 @@ import numpy as np
 from run_folder import FinishedRun
 
 from active3d_pipe.evaluation.image_metrics import psnr, ssim
+from active3d_pipe.geometry.sampling import spread
 from active3d_pipe.mapping import branches, update
 from active3d_pipe.mapping.config import MappingSettings
 from active3d_pipe.mapping.hybrid_map import HybridMap
@@ -141,7 +142,7 @@ def main() -> None:
     run = FinishedRun(given.run)
     views = run.held_out(given.views)
     everything = [f for frames in data.frames for f in frames]
-    seen = shared.spread(everything, given.views)
+    seen = spread(everything, given.views)
     steps = len(everything)
     print(f"{given.run.name}: {steps} frames in {len(data.frames)} rounds, {len(views)} held-out views", flush=True)
     truth, head, rule = None, "", ""

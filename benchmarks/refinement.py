@@ -50,7 +50,7 @@ def main() -> None:
     given = parser.parse_args()
     run = FinishedRun(given.run)
     views, last = run.held_out(), run.path / "mapping" / f"round_{run.last_round:04d}"
-    frames = shared.load_spread(run.inputs, run.last_round, MAX_FRAMES)
+    frames = shared.load_covering(run.inputs, run.last_round, MAX_FRAMES)
     truth, head = None, ""
     if given.mesh:
         truth = run.truth()

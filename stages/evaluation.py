@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from active3d_pipe.evaluation.geometry_metrics import TruthSurface
     from active3d_pipe.evaluation.views import ViewScores
 
-MAX_FRAMES = 1000  # logged frames that say what was seen, evenly spread: bounds the memory of long runs
+MAX_FRAMES = 1000  # logged frames that say what was seen: bounds the memory of long runs
 CURVE_ROUNDS = 16  # rounds whose surfaces are measured for the curves over steps
 
 
@@ -42,7 +42,7 @@ def _run(context: StageContext) -> None:
     config = context.config
     settings = config.evaluation
     simulator = shared.make_simulator(config, config.run.seed)
-    frames = shared.load_spread(context.inputs, context.last_round, MAX_FRAMES)
+    frames = shared.load_covering(context.inputs, context.last_round, MAX_FRAMES)
     hybrid = shared.load_map(context.input("export"), context.inputs, config, to_train=False)
     mesh = meshes.read_mesh(context.input("export") / "mesh.ply")
 
@@ -151,7 +151,7 @@ def _write_examples(folder: Path, render: Any, sets: dict, scores: "dict[str, Vi
 
 
 STAGE = Stage(
-    name="evaluation", version=2, config=("evaluation", "scene", "camera", "sensor", "mapping", "run.seed"),
+    name="evaluation", version=3, config=("evaluation", "scene", "camera", "sensor", "mapping", "run.seed"),
     inputs=_inputs, run=_run, loop=False, parameters=_parameters,
     unkeyed=("scene.file",),
 )

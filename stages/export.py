@@ -3,7 +3,7 @@
 from active3d_pipe.pipeline.stage import NodeId, Stage, StageContext
 from stages import shared
 
-MAX_FRAMES = 700  # logged frames that refinement and culling use, evenly spread: bounds the memory of long runs
+MAX_FRAMES = 700  # logged frames that refinement and mesh use: bounds the memory of long runs
 
 
 def _inputs(last_round: int) -> tuple[NodeId, ...]:
@@ -21,7 +21,7 @@ def _run(context: StageContext) -> None:
 
     config, last = context.config, context.last_round
     hybrid = shared.load_map(context.input("mapping", last), context.inputs, config)
-    frames = shared.load_spread(context.inputs, last, MAX_FRAMES)
+    frames = shared.load_covering(context.inputs, last, MAX_FRAMES)
     report = refine(hybrid, frames, context.rng("refinement"), context.progress)
     context.timings.update(report.seconds)
 
@@ -46,4 +46,4 @@ def _run(context: StageContext) -> None:
     context.notes.update(numbers)
 
 
-STAGE = Stage(name="export", version=10, config=("mapping", "export"), inputs=_inputs, run=_run, loop=False)
+STAGE = Stage(name="export", version=11, config=("mapping", "export"), inputs=_inputs, run=_run, loop=False)

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from active3d_pipe.geometry.sampling import spread
 from active3d_pipe.pipeline.stage import NodeId
 
 if TYPE_CHECKING:
@@ -90,11 +89,15 @@ def _keep_frames(key: tuple, frames: "list[Frame]") -> None:
         _frames.popitem(last=False)
 
 
-def load_spread(inputs: Mapping[NodeId, Path], last_round: int, most: int) -> "list[Frame]":
-    """At most `most` of the frames of rounds 0..last_round, evenly spread: a long run need not fit into memory."""
+def load_covering(inputs: Mapping[NodeId, Path], last_round: int, most: int) -> "list[Frame]":
+    """At most `most` of the frames of rounds 0..last_round, showing what all show: long runs need not fit in memory."""
+    from active3d_pipe.mapping.frame_choice import covering, surface_cells
+
     folders = [inputs[node] for node in captures(last_round)]
     steps = [len(read_capture(folder)["poses"]) for folder in folders]
-    chosen = set(spread(range(sum(steps)), most))
+    if sum(steps) <= most:
+        return [frame for folder in folders for frame in load_frames(folder)]
+    chosen = set(covering([surface_cells(frame) for folder in folders for frame in load_frames(folder)], most))
     first = np.cumsum([0, *steps])
     found = []
     for folder, start, stop in zip(folders, first, first[1:], strict=False):

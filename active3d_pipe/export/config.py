@@ -41,7 +41,7 @@ class MeshSettings(Settings):
         2.0, gt=0, description="truncation of that fusion, marching-cubes cells"
     )
     sheet_frames: int = Field(
-        3, ge=0, description="frames with readings off the surface from which faces are laid through them; 0: never"
+        2, ge=0, description="frames with readings off the surface from which faces are laid through them; 0: never"
     )
     sheet_agreement: float = Field(
         0.25, ge=0, le=1, description="least share of the frames it is not hidden from that must read surface there"

@@ -10,6 +10,7 @@ from numba import njit, prange
 
 OPEN, EXPLAINED = np.uint8(0), np.uint8(1)
 _DONE = np.uint8(3)  # explained, and so are the cells around it
+EVEN = np.float32(0.25)  # how much the slope of a plane may seem to change from one pixel to the next
 
 
 @njit(parallel=True, cache=True)
@@ -93,13 +94,40 @@ def vote(points, rotation, centre, intrinsics, depth, near, tolerance, hidden, a
             other[n] += 1
 
 
+@njit(inline="always")
+def _one_plane(depth, i, j, down, across, step, longest):
+    """Whether the readings of pixel (i, j) and of the next one, (i + down, j + across), lie on one surface.
+
+    Their depths differ by at most `step` times the depth; or by more, up to `longest`, on a plane seen at a slant:
+    along it the inverse depth changes evenly from pixel to pixel, and so it must on one side of the two.
+    """
+    height, width = depth.shape
+    a, b = depth[i, j], depth[i + down, j + across]
+    apart, nearest = abs(a - b), min(a, b)
+    if apart <= step * nearest:
+        return True
+    if apart > longest * nearest:
+        return False
+    slope = np.float32(1) / b - np.float32(1) / a
+    u, v = i - down, j - across
+    if u >= 0 and v >= 0 and depth[u, v] > 0:
+        before = np.float32(1) / a - np.float32(1) / depth[u, v]
+        if abs(before - slope) <= EVEN * abs(slope):
+            return True
+    u, v = i + 2 * down, j + 2 * across
+    if u < height and v < width and depth[u, v] > 0:
+        after = np.float32(1) / depth[u, v] - np.float32(1) / b
+        return abs(after - slope) <= EVEN * abs(slope)
+    return False
+
+
 @njit(cache=True)
-def sheet_faces(cells, own, depth, step, numbers, faces):
+def sheet_faces(cells, own, depth, step, longest, numbers, faces):
     """Faces over a frame's pixels, and their number; `numbers` (H, W) int32 gets the vertex of a pixel, or -1.
 
     own (H, W) bool: the pixel's cell is to be covered from this frame. Two triangles join four neighbouring
-    pixels that all have unexplained readings, of which the first is the frame's own, whose depths differ by at most
-    `step` times the depth. `faces` (F, 3) int32 has room for all.
+    pixels that all have unexplained readings, of which the first is the frame's own, and that lie on one surface
+    (`_one_plane`, steps relative to the depth). `faces` (F, 3) int32 has room for all.
     """
     height, width = depth.shape
     num_vertices = num_faces = 0
@@ -110,9 +138,10 @@ def sheet_faces(cells, own, depth, step, numbers, faces):
                 continue
             if cells[i, j] < 0 or cells[i, j + 1] < 0 or cells[i + 1, j] < 0 or cells[i + 1, j + 1] < 0:
                 continue
-            nearest = min(min(depth[i, j], depth[i, j + 1]), min(depth[i + 1, j], depth[i + 1, j + 1]))
-            farthest = max(max(depth[i, j], depth[i, j + 1]), max(depth[i + 1, j], depth[i + 1, j + 1]))
-            if farthest - nearest > step * nearest:
+            if not (
+                _one_plane(depth, i, j, 0, 1, step, longest) and _one_plane(depth, i + 1, j, 0, 1, step, longest)
+                and _one_plane(depth, i, j, 1, 0, step, longest) and _one_plane(depth, i, j + 1, 1, 0, step, longest)
+            ):
                 continue
             for m in range(4):
                 if numbers[i + (m >> 1), j + (m & 1)] < 0:

@@ -17,7 +17,8 @@ from active3d_pipe.structures import Frame, TriangleMesh, VoxelGrid
 CELL = 1.25  # edge of a cell, in marching-cubes cells: a reading is explained within one to two of them from a face
 HIDDEN = 4.0  # cells before a point up to which a reading is taken for scatter, not for something that hides it
 FAR_M = 3.0  # up to there pixels are so dense that no cell is skipped when some are
-FOOTPRINTS = 3.0  # neighbouring pixels belong to one sheet when their depths differ by less than so many pixels
+FOOTPRINTS = 3.0  # neighbouring pixels belong to one sheet when their depths differ by less than so many pixels ...
+SLANTED = 20.0  # ... or than so many, if the sheet goes on as evenly beside them
 
 
 def with_sheets(
@@ -105,8 +106,8 @@ def _lay(frame: Frame, grid: VoxelGrid, marks: np.ndarray, owned: np.ndarray) ->
     at = cells >= 0
     own[at] = np.isin(cells[at], owned)
     numbers, faces = np.empty(cells.shape, np.int32), np.empty((2 * int(own.sum()), 3), np.int32)
-    step = np.float32(FOOTPRINTS / min(frame.camera.fx, frame.camera.fy))
-    num_faces = kernels.sheet_faces(cells, own, depth, step, numbers, faces)
+    step, longest = (np.float32(n / min(frame.camera.fx, frame.camera.fy)) for n in (FOOTPRINTS, SLANTED))
+    num_faces = kernels.sheet_faces(cells, own, depth, step, longest, numbers, faces)
     rows, columns = np.nonzero(numbers >= 0)
     order = np.argsort(numbers[rows, columns])
     return _points(frame, rows[order], columns[order]), faces[:num_faces].copy()

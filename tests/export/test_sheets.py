@@ -11,6 +11,7 @@ from active3d_pipe.geometry.raycasting import SurfaceIndex
 from active3d_pipe.structures import Camera, Frame, TriangleMesh
 
 CAMERA = Camera.from_fov(120, 90, 70.0, far=8)
+FINE = Camera.from_fov(480, 360, 70.0, far=8)
 WALL_Y, LEAF_Y, LEAF = 2.0, 1.2, 0.12  # planes across y; half the side of the leaf, around the origin of x and z
 SETTINGS = MeshSettings()
 BOX = np.array([-3.0, -0.5, -2.5]), np.array([3.0, 2.5, 2.5])
@@ -84,6 +85,35 @@ def test_without_a_mesh_everything_is_laid() -> None:
     nothing = TriangleMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
     after = with_sheets(nothing, frames(), *BOX, SETTINGS)
     assert np.abs(after.vertices[:, 1] - WALL_Y).min() < 1e-3 and len(after.faces) > 5000
+
+
+def slanted(degrees: float, gap: float) -> list[Frame]:
+    """Views along a floor at so many degrees from it; from x = 0.5 on it lies `gap` m higher."""
+    out, slope = [], np.tan(np.radians(degrees))
+    for i, x in enumerate(np.linspace(-0.1, 0.1, 4)):
+        T = se3.look_at(np.array([x - 1.5, 0.0, 1.5 * slope]), np.array([x, 0.0, 0.0]))
+        rays = projection.pixel_rays(FINE).astype(np.float64) @ T[:3, :3].T
+        depth = np.zeros(rays.shape[:2])
+        for height in (0.0, gap):
+            with np.errstate(divide="ignore"):
+                t = (height - T[2, 3]) / rays[..., 2]
+            at = T[:3, 3] + t[..., None] * rays
+            side = at[..., 0] < 0.5 if height == 0.0 else at[..., 0] >= 0.5
+            near = (t > 0) & (np.abs(at[..., 0] - 0.5) < 0.6) & (np.abs(at[..., 1]) < 0.4)
+            depth = np.where(near & side & ((depth == 0) | (t < depth)), t, depth)
+        out.append(Frame(i, i, FINE, T, np.zeros((*depth.shape, 3), np.uint8), depth.astype(np.float32)))
+    return out
+
+
+def test_a_floor_seen_at_a_slant_is_laid_and_a_step_in_it_is_not_bridged() -> None:
+    nothing = TriangleMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
+    views = slanted(12.0, gap=0.05)
+    after = with_sheets(nothing, views, np.array([-1.0, -1, -0.5]), np.array([2.0, 1, 0.5]), SETTINGS)
+    corners = after.vertices[after.faces]
+    assert (np.ptp(corners[..., 2], axis=1) < 1e-3).all()  # level: none joins the floor with the step
+    x, y = np.meshgrid(np.linspace(0.1, 0.4, 12), np.linspace(-0.2, 0.2, 9))
+    floor = np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3)
+    assert np.quantile(distances(after, floor), 0.9) < 0.04
 
 
 def test_votes_match_a_plain_loop() -> None:
