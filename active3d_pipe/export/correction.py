@@ -16,6 +16,11 @@ MOST_FRAMES = 200  # evenly spread, that are compared with the field
 MOST_FUSED = 128  # frames that are fused: those with the most readings that contradict
 LEAST_READINGS = 3  # in a cell, for their mean to count
 SURE = 3.0  # standard errors that it must lie off the surface
+SCATTER_M = 0.12  # within which noise shows on both sides of a surface
+OTHER_SIDE = 0.2  # share of the contradiction that may lie on the other side, where noise may explain it:
+SCATTER = 5.0  # up to so many standard deviations of the sensor's noise
+NOISE_STRIDE = 16  # rows of an image, every how many say what the sensor's noise is
+FROM_MEDIAN = 1 / (0.6745 * 6**0.5)  # standard deviation of a reading by the median of |a - 2 b + c|
 MOST_READINGS = 16  # in a cell, after which further frames are not asked about it
 
 
@@ -75,9 +80,10 @@ def _disputed(
     """Grid, the cells (X, Y, Z) bool in and beside which readings contradict, and the frames that do so most."""
     grid = VoxelGrid.from_bounds(low, high, 2 * settings.voxel_size_m)
     origin, inv_cell = grid.origin.astype(np.float32), np.float32(1 / grid.voxel_size)
-    sums, squares = np.zeros(grid.shape, np.float32), np.zeros(grid.shape, np.float32)
+    sums, below, squares, noises = (np.zeros(grid.shape, np.float32) for _ in range(4))
     counts = np.zeros(grid.shape, np.int32)
     compared = spread(frames, MOST_FRAMES)
+    sensor = sensor_noise(compared)
     against = np.zeros(len(compared), np.int64)
     for index in _scattered(len(compared)):
         frame = compared[index]
@@ -88,7 +94,9 @@ def _disputed(
         )]
         if len(points):
             values = query_sdf(points)
-            kernels.add_readings(points, values, origin, inv_cell, sums, squares, counts)
+            depth = (points - frame.T_world_camera[:3, 3].astype(np.float32)) @ frame.T_world_camera[:3, 2]
+            noise = sensor[np.clip(depth, 0, len(sensor) - 1).astype(np.int64)]
+            kernels.add_readings(points, values, noise, origin, inv_cell, sums, below, squares, noises, counts)
             against[index] = (np.abs(values) > settings.dispute_m).sum()
     marks = np.zeros(grid.shape, bool)
     cells = np.nonzero(counts >= LEAST_READINGS)
@@ -96,9 +104,37 @@ def _disputed(
     mean = sums[cells] / n
     # Its standard error: a sensor's noise alone must not outvote the field.
     error = np.sqrt(np.maximum(squares[cells] / n - mean**2, 0) / (n - 1))
-    marks[cells] = np.abs(mean) > np.maximum(settings.dispute_m, SURE * error)
+    off = np.abs(mean) > np.maximum(settings.dispute_m, SURE * error)
+    # Nor may what noise scatters before a surface, and behind it: in a cell off it, all readings are off.
+    doubtful = off & (np.abs(mean) < SCATTER * noises[cells] / n)
+    keep, where = np.zeros(int(doubtful.sum()), bool), np.stack(cells, axis=-1)
+    kernels.one_sided(sums, below, where[doubtful], round(SCATTER_M / grid.voxel_size), OTHER_SIDE, keep)
+    off[doubtful] = keep
+    marks[tuple(where[off].T)] = True
     order = np.argsort(-against, kind="stable")[:MOST_FUSED]
     return grid, dilated(marks, 1), [compared[int(i)] for i in np.sort(order)]
+
+
+def sensor_noise(frames: Sequence[Frame]) -> np.ndarray:
+    """(D,) float32 standard deviation of the depth noise, m, of readings from 0 to 1 m, from 1 to 2 m, and so on.
+
+    By the second difference of the inverse depth along image rows, which is zero on planes, however they are seen: its
+    median over all readings leaves edges and what is curved out of account.
+    """
+    depths, errors = [], []
+    for frame in frames:
+        d = frame.depth[NOISE_STRIDE // 2 :: NOISE_STRIDE]
+        d = np.where(d > 0, d, np.nan)
+        inverse, middle = 1 / d, d[:, 1:-1]
+        error = np.abs(inverse[:, :-2] - 2 * inverse[:, 1:-1] + inverse[:, 2:]) * middle**2
+        known = np.isfinite(error)
+        depths.append(middle[known].astype(np.int64))
+        errors.append(error[known])
+    near, error = np.concatenate(depths), np.concatenate(errors)
+    out = np.zeros(max(int(near.max(initial=0)), 0) + 1, np.float32)
+    for metre in np.unique(near):
+        out[metre] = np.median(error[near == metre]) * FROM_MEDIAN
+    return out
 
 
 def _scattered(count: int) -> list[int]:

@@ -34,9 +34,11 @@ def open_readings(rotation, centre, lens, depth, stride, reach, origin, inv_cell
 
 
 @njit(cache=True)
-def add_readings(points, values, origin, inv_cell, sums, squares, counts):
-    """Add values (N,) f32, their squares and 1 to the cells of sums (X, Y, Z), squares f32 and counts i32 that points
-    (N, 3) lie in."""
+def add_readings(points, values, noise, origin, inv_cell, sums, below, squares, noises, counts):
+    """Add values (N,) f32, those below zero, their squares, noise (N,) f32 and 1 to the cells of points (N, 3).
+
+    sums, below, squares, noises (X, Y, Z) f32 and counts i32.
+    """
     nx, ny, nz = counts.shape
     for n in range(points.shape[0]):
         x = np.int64(np.floor((points[n, 0] - origin[0]) * inv_cell))
@@ -44,8 +46,29 @@ def add_readings(points, values, origin, inv_cell, sums, squares, counts):
         z = np.int64(np.floor((points[n, 2] - origin[2]) * inv_cell))
         if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
             sums[x, y, z] += values[n]
+            below[x, y, z] += min(values[n], np.float32(0))
             squares[x, y, z] += values[n] * values[n]
+            noises[x, y, z] += noise[n]
             counts[x, y, z] += 1
+
+
+@njit(parallel=True, cache=True)
+def one_sided(sums, below, cells, reach, share, keep):
+    """keep (N,) bool: whether around cells (N, 3) the values have the sign of the cell's sum, but for a share of them.
+
+    Of all values within `reach` cells along each axis, those of the other sign sum to at most `share` of the others.
+    """
+    nx, ny, nz = sums.shape
+    for n in prange(cells.shape[0]):
+        i, j, k = cells[n, 0], cells[n, 1], cells[n, 2]
+        total, negative = 0.0, 0.0
+        for a in range(max(i - reach, 0), min(i + reach + 1, nx)):
+            for b in range(max(j - reach, 0), min(j + reach + 1, ny)):
+                for c in range(max(k - reach, 0), min(k + reach + 1, nz)):
+                    total += sums[a, b, c]
+                    negative -= below[a, b, c]
+        positive = total + negative
+        keep[n] = negative <= share * positive if sums[i, j, k] > 0 else positive <= share * negative
 
 
 @njit(cache=True)

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from active3d_pipe.export import correction
 from active3d_pipe.export import kernels_correction as kernels
 from active3d_pipe.export.config import MeshSettings
 from active3d_pipe.export.correction import corrected_sdf
@@ -67,6 +68,38 @@ def test_a_field_that_is_right_is_left_alone(noise):
     assert changed.mean() < (1e-9 if noise == 0 else 0.03)
 
 
+def test_what_noise_scatters_about_a_wall_is_no_contradiction(monkeypatch):
+    """A field that is right before the wall and, like any, flat behind it; noise of up to ten marching-cubes cells."""
+
+    def wall(points):
+        return np.maximum(np.asarray(points)[:, 0] + 0.5, -0.05).astype(np.float32)
+
+    rng, camera, frames = np.random.default_rng(4), Camera.from_fov(120, 120, 60), []
+    for y in np.linspace(-0.3, 0.3, 12):
+        T = se3.look_at([0.9, y, 0.1], [-0.5, 0.5 * y, 0])
+        rays = projection.pixel_rays(camera).astype(np.float64) @ T[:3, :3].T
+        depth = (-0.5 - T[0, 3]) / rays[..., 0] + rng.normal(0, 0.04, rays.shape[:2])
+        frames.append(Frame(0, 0, camera, T, np.zeros((120, 120, 3), np.uint8), depth.astype(np.float32)))
+    noise = correction.sensor_noise(frames)
+    assert noise[1] == pytest.approx(0.04, rel=0.05)
+    points = rng.uniform([-0.7, -0.4, -0.4], [-0.2, 0.4, 0.4], (4000, 3)).astype(np.float32)
+
+    def changed():
+        return (corrected_sdf(wall, LOW, HIGH, frames, SETTINGS)(points) != wall(points)).mean()
+
+    assert changed() < 0.02
+    monkeypatch.setattr(correction, "SCATTER", 0.0)
+    assert changed() > 0.3  # what it would be otherwise
+
+
+def test_noiseless_depth_has_no_noise():
+    noise = correction.sensor_noise(both_sides())
+    assert noise.dtype == np.float32 and noise.max() < 1e-4
+    nothing = view((0.9, 0.0, 0.0))
+    nothing.depth[:] = 0
+    assert correction.sensor_noise([nothing]).tolist() == [0.0]
+
+
 def test_zero_means_never():
     settings = SETTINGS.model_copy(update={"dispute_m": 0.0})
     assert corrected_sdf(washed_out, LOW, HIGH, both_sides(), settings) is washed_out
@@ -121,8 +154,10 @@ def test_readings_of_full_cells_are_left_out():
     inside = ((whole >= LOW) & (whole < LOW + np.array(counts.shape) * 0.08)).all(axis=1)
     assert len(first) == inside.sum() > 50
     assert np.abs(first - whole[inside]).max() < 1e-4
-    sums, squares = np.zeros(counts.shape, np.float32), np.zeros(counts.shape, np.float32)
-    kernels.add_readings(first, np.full(len(first), 0.5, np.float32), origin, inv_cell, sums, squares, counts)
-    assert counts.sum() == len(first) and np.allclose(sums, 0.5 * counts) and np.allclose(squares, 0.25 * counts)
+    sums, below, squares, noises = (np.zeros(counts.shape, np.float32) for _ in range(4))
+    values, noise = (np.full(len(first), a, np.float32) for a in (-0.5, 0.1))
+    kernels.add_readings(first, values, noise, origin, inv_cell, sums, below, squares, noises, counts)
+    assert counts.sum() == len(first) and np.allclose(noises, 0.1 * counts)
+    assert np.allclose(sums, -0.5 * counts) and np.allclose(below, sums) and np.allclose(squares, 0.25 * counts)
     cells = tuple(np.floor((first - origin) * inv_cell).astype(int).T)
     assert len(readings()) == (counts[cells] < 5).sum()
