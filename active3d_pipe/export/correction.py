@@ -12,8 +12,8 @@ from active3d_pipe.geometry.sampling import spread
 from active3d_pipe.structures import Frame, VoxelGrid
 
 STRIDE = 4  # of the pixels, every how many are compared with the field
-MOST_FRAMES = 200  # evenly spread, that are compared with the field
-MOST_FUSED = 128  # frames that are fused: those with the most readings that contradict
+MOST_FRAMES = 700  # evenly spread, that are compared with the field
+MOST_FUSED = 256  # frames that are fused: those with the most readings that contradict
 LEAST_READINGS = 3  # in a cell, for their mean to count
 SURE = 3.0  # standard errors that it must lie off the surface
 SCATTER_M = 0.12  # within which noise shows on both sides of a surface
