@@ -17,8 +17,8 @@ MOST_FUSED = 256  # frames that are fused: those with the most readings that con
 LEAST_READINGS = 3  # in a cell, for their mean to count
 SURE = 3.0  # standard errors that it must lie off the surface
 SCATTER_M = 0.12  # within which noise shows on both sides of a surface
-OTHER_SIDE = 0.2  # share of the contradiction that may lie on the other side, where noise may explain it:
-SCATTER = 5.0  # up to so many standard deviations of the sensor's noise
+BY_NOISE = 5.0  # standard deviations of the sensor's noise up to which it may explain a contradiction
+OTHER_SIDE = 0.2  # share of such a contradiction that may lie on the other side of the surface
 NOISE_STRIDE = 16  # rows of an image, every how many say what the sensor's noise is
 FROM_MEDIAN = 1 / (0.6745 * 6**0.5)  # standard deviation of a reading by the median of |a - 2 b + c|
 MOST_READINGS = 16  # in a cell, after which further frames are not asked about it
@@ -106,7 +106,7 @@ def _disputed(
     error = np.sqrt(np.maximum(squares[cells] / n - mean**2, 0) / (n - 1))
     off = np.abs(mean) > np.maximum(settings.dispute_m, SURE * error)
     # Nor may what noise scatters before a surface, and behind it: in a cell off it, all readings are off.
-    doubtful = off & (np.abs(mean) < SCATTER * noises[cells] / n)
+    doubtful = off & (np.abs(mean) < BY_NOISE * noises[cells] / n)
     keep, where = np.zeros(int(doubtful.sum()), bool), np.stack(cells, axis=-1)
     kernels.one_sided(sums, below, where[doubtful], round(SCATTER_M / grid.voxel_size), OTHER_SIDE, keep)
     off[doubtful] = keep

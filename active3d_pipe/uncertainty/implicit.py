@@ -4,7 +4,6 @@ import numpy as np
 from scipy.special import ndtr
 
 from active3d_pipe.information.entropy import bernoulli_entropy
-from active3d_pipe.uncertainty import kernels
 from active3d_pipe.uncertainty.config import UncertaintySettings
 
 
@@ -81,8 +80,7 @@ def implicit_entropy(
     1 where nothing was observed.
     """
     scale = np.maximum(sigma, np.float32(settings.sigma_floor_m))
-    h = np.empty(sdf.shape, np.float32)
     low, high = ((sdf + sign * support) / scale for sign in (np.float32(-1), np.float32(1)))
-    kernels.mean_between(low.ravel(), high.ravel(), ENTROPY_INTEGRAL, ENTROPY_REACH, h.reshape(-1))
-    np.clip(h, 0, 1, out=h)
+    low_sum, high_sum = (np.interp(z, _Z, ENTROPY_INTEGRAL) for z in (low, high))
+    h = np.clip((high_sum - low_sum) / (high - low), 0, 1)
     return (1 - observed * (1 - h)).astype(np.float32)

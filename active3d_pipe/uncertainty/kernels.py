@@ -155,18 +155,3 @@ def mean_at_readings(depth, camera, pose, first, stride, origin, size, values):
                 total += values[a, b, c]
                 count += 1
     return total / count if count else 0.0
-
-
-@njit(parallel=True, cache=True)
-def mean_between(low, high, table, reach, out):
-    """out = (I(high) - I(low)) / (high - low) for an integral I tabulated evenly over [-reach, reach], flat f32."""
-    last = table.size - 1
-    scale = last / (2.0 * reach)
-    for n in prange(out.size):
-        value = 0.0
-        for side in range(2):
-            z = min(max((low[n] if side == 0 else high[n]) + reach, 0.0), 2.0 * reach) * scale
-            i = min(int(z), last - 1)
-            at = table[i] + (z - i) * (table[i + 1] - table[i])
-            value += at if side == 1 else -at
-        out[n] = value / (high[n] - low[n])

@@ -1,7 +1,7 @@
 """What is computed voxel by voxel, in one pass over the volume; `reference_terms.py` is the slow twin.
 
 The formulas are those of `occupancy`, `implicit` and `temporal`, where they are explained. Most voxels of a volume were
-never seen or are surely free, and need little of them; whole arrays would pass through memory some sixty times.
+never seen or are surely free, and need little of them; whole arrays would pass through memory many times.
 """
 
 # mypy: disable-error-code=no-untyped-def

@@ -44,12 +44,13 @@ def voxel_terms(
         previous: volume of the last round, None in the first.
     """
     sdf, sigma = geometry
+    constants = _constants(settings)._replace(voxel_size_m=float(voxel_size))
     out = VoxelTerms(*(np.zeros(sdf.shape, np.float32) for _ in range(6)))
     nothing = np.zeros((1, 1, 1), np.float32)
     last_sdf, last_u_time = (nothing, nothing) if previous is None else (previous["sdf"], previous["u_time"])
     kernels_terms.voxel_terms(
         evidence.free, evidence.hit, fresh.free, fresh.hit, vain, mass, sdf, sigma, last_sdf, last_u_time,
-        previous is not None, _constants(settings, voxel_size), implicit.ENTROPY_INTEGRAL, implicit.ENTROPY_REACH,
+        previous is not None, constants, implicit.ENTROPY_INTEGRAL, implicit.ENTROPY_REACH,
         out.attention, out.u_imp, out.u_time, out.occupancy, out.entropy_imp, out.entropy_exp,
     )
     return out
@@ -63,10 +64,9 @@ def open_to_the_field(evidence: RayEvidence, settings: UncertaintySettings) -> n
     """
     out = np.zeros(evidence.free.shape, np.uint8)
     least = np.log(MASKED / (2 - MASKED))  # of the log-odds, where `occupancy.attention` is MASKED
-    kernels_terms.near_open_space(evidence.free, evidence.hit, _constants(settings, 1.0), least, out)
+    kernels_terms.near_open_space(evidence.free, evidence.hit, _constants(settings), least, out)
     return out.view(bool)
 
 
-def _constants(settings: UncertaintySettings, voxel_size: float) -> TermConstants:
-    values = {name: float(getattr(settings, name)) for name in TermConstants._fields}
-    return TermConstants(**values)._replace(voxel_size_m=float(voxel_size))
+def _constants(settings: UncertaintySettings) -> TermConstants:
+    return TermConstants(*(float(getattr(settings, name)) for name in TermConstants._fields))

@@ -88,7 +88,7 @@ def test_what_noise_scatters_about_a_wall_is_no_contradiction(monkeypatch):
         return (corrected_sdf(wall, LOW, HIGH, frames, SETTINGS)(points) != wall(points)).mean()
 
     assert changed() < 0.02
-    monkeypatch.setattr(correction, "SCATTER", 0.0)
+    monkeypatch.setattr(correction, "BY_NOISE", 0.0)
     assert changed() > 0.3  # what it would be otherwise
 
 
