@@ -89,18 +89,21 @@ def _run(context: StageContext) -> None:
 
 
 def _curves(context: StageContext, truth: "TruthSurface") -> list[dict[str, Any]]:
-    """Completion and accuracy of the surface of every sampled round."""
+    """Completion and accuracy of the surface of every sampled round, by steps and walked metres."""
+    from itertools import accumulate
+
     from active3d_pipe.evaluation import evaluate as ev
     from active3d_pipe.storage import meshes
-    from active3d_pipe.storage.files import read_json
 
     settings = context.config.evaluation
+    logs = [shared.read_capture(context.input("capture", k)) for k in range(context.last_round + 1)]
+    walked = list(accumulate(d["path_length_m"] for d in logs))
     points = []
     for node, folder in context.inputs.items():
         if node.stage == "uncertainty" and node.round is not None:
-            steps = read_json(context.input("capture", node.round) / shared.CAPTURE_NAME)["steps_total"]
             surface = meshes.read_mesh(folder / shared.SURFACE_NAME)
-            points.append({"round": node.round, **ev.curve_point(steps, surface, truth, settings)})
+            values = ev.curve_point(logs[node.round]["steps_total"], surface, truth, settings)
+            points.append({"round": node.round, "path_m": round(walked[node.round], 3), **values})
             context.progress(f"curve at round {node.round}")
     return points
 
@@ -151,7 +154,7 @@ def _write_examples(folder: Path, render: Any, sets: dict, scores: "dict[str, Vi
 
 
 STAGE = Stage(
-    name="evaluation", version=3, config=("evaluation", "scene", "camera", "sensor", "mapping", "run.seed"),
+    name="evaluation", version=4, config=("evaluation", "scene", "camera", "sensor", "mapping", "run.seed"),
     inputs=_inputs, run=_run, loop=False, parameters=_parameters,
     unkeyed=("scene.file",),
 )

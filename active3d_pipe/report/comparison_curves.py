@@ -48,7 +48,7 @@ def completion_figure(results: Sequence[Result], labels: Mapping[str, str]) -> F
 
 def _panel(axes: Axes, results: Sequence[Result], labels: Mapping[str, str], column: int) -> None:
     for i, (variant, label) in enumerate(labels.items()):
-        curves = [r.curve for r in results if r.variant == variant]
+        curves = [r.curve for r in results if r.variant == variant and np.isfinite(r.curve[:, column]).all()]
         color, style = SERIES[i % len(SERIES)], STYLES[i // len(SERIES) % len(STYLES)]
         if not curves:
             axes.plot([], [], color=color, linestyle=style, label=f"{label} (none)")

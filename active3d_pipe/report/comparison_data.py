@@ -48,16 +48,11 @@ def loop_seconds(run: Path) -> float | None:
 
 
 def _curve(run: Path) -> np.ndarray:
-    """(P, 3) step, walked metres, completion ratio."""
+    """(P, 3) step, walked metres (NaN where the evaluation does not say), completion ratio."""
     if not (run / CURVES_FILE).is_file():
         return np.zeros((0, 3))
     points = [p for p in _json(run / CURVES_FILE) if p.get(CURVE) is not None]
-    metres, total = {}, 0.0
-    for k in range(max((p["round"] for p in points), default=-1) + 1):
-        capture = run / "capture" / f"round_{k:04d}" / "capture.json"
-        total += float(_json(capture)["path_length_m"]) if capture.is_file() else 0.0
-        metres[k] = total
-    return np.array([(p["step"], metres[p["round"]], p[CURVE]) for p in points]).reshape(-1, 3)
+    return np.array([(p["step"], p.get("path_m", np.nan), p[CURVE]) for p in points]).reshape(-1, 3)
 
 
 def _json(path: Path) -> Any:

@@ -7,7 +7,7 @@ import pytest
 
 from active3d_pipe.report import comparison as c
 from active3d_pipe.report import comparison_tables as tables
-from active3d_pipe.report.comparison_curves import band, write_figure
+from active3d_pipe.report.comparison_curves import band, completion_figure, write_figure
 from active3d_pipe.report.comparison_data import read_result
 from tests.tiny_run import active3d
 
@@ -135,17 +135,20 @@ def test_figures_are_written_and_equal_bytes(results, tmp_path):
     assert write_figure([result("a", "ours", 0, state="missing")], LABELS, tmp_path) == []
 
 
+def test_a_curve_without_metres_is_drawn_over_steps_alone():
+    curve = np.array([[10, np.nan, 0.5], [20, np.nan, 0.75]])
+    figure = completion_figure([c.Result("a", "ours", 0, "done", {}, curve)], {"ours": "ours"})
+    over_steps, over_metres = figure.axes
+    assert len(over_steps.lines[0].get_xdata()) > 0 and len(over_metres.lines[0].get_xdata()) == 0
+
+
 def fabricate(run):
     """The files of a finished run that tables are made of."""
     (run / "evaluation").mkdir(parents=True)
     (run / "evaluation" / "metrics.json").write_text(json.dumps({"metrics": {"psnr": 30.0, "steps": 20, "x": None}}))
     key = "completion_ratio_surface_observable"
-    points = [{"round": 0, "step": 10, key: 0.5}, {"round": 2, "step": 20, key: 0.75}]
+    points = [{"round": 0, "step": 10, "path_m": 0.5, key: 0.5}, {"round": 2, "step": 20, "path_m": 3.5, key: 0.75}]
     (run / "evaluation" / "curves.json").write_text(json.dumps(points))
-    for k, metres in enumerate((0.5, 1.0, 2.0)):
-        folder = run / "capture" / f"round_{k:04d}"
-        folder.mkdir(parents=True)
-        (folder / "capture.json").write_text(json.dumps({"path_length_m": metres}))
     events = [("capture/round_0000", 1.0), ("capture/round_0000", 3.0), ("mapping/round_0000", 5.0), ("export", 9.0)]
     lines = [json.dumps({"event": "commit", "node": n, "seconds": s}) for n, s in events]
     (run / "journal.jsonl").write_text("\n".join(lines))
