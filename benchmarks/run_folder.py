@@ -73,4 +73,6 @@ class FinishedRun:
         """(N,) bool, whether a reachable pose can see each point; the same draw as in the evaluation."""
         from active3d_pipe.sim.observable import observable_points
 
-        return observable_points(self.simulator, points, np.random.default_rng(self.config.evaluation.seed))
+        rng, motion = np.random.default_rng(self.config.evaluation.seed), self.config.motion
+        planar = motion.model == "ground"
+        return observable_points(self.simulator, points, rng, radius_m=motion.agent_radius_m, planar=planar)

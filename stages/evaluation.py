@@ -50,8 +50,10 @@ def _run(context: StageContext) -> None:
     scene = simulator.scene
 
     def observable(points: np.ndarray) -> np.ndarray:
-        # Seeded by the evaluation, not by the run: every run is judged on the same points.
-        return observable_points(simulator, points, np.random.default_rng(settings.seed))
+        # Seeded by the evaluation, not by the run: every run of such an agent is judged on the same points.
+        rng, motion = np.random.default_rng(settings.seed), config.motion
+        planar = motion.model == "ground"
+        return observable_points(simulator, points, rng, radius_m=motion.agent_radius_m, planar=planar)
 
     truth = prepare_truth(scene.surface, settings, observable)
     context.progress("geometry")
@@ -118,10 +120,17 @@ def _view_sets(simulator: Any, frames: list, settings: Any) -> dict[str, list]:
     circle = circle_poses(scene.start_pose[:3, 3], settings.circle_radius_m, settings.circle_views)
     circle = circle[simulator.clearance(circle[:, :3, 3]) >= settings.view_clearance_m]
     return {
-        "heldout": [simulator.render(T, step=i) for i, T in enumerate(held_out)],
-        "circle": [simulator.render(T, step=i) for i, T in enumerate(circle)],
+        "heldout": [_true_view(simulator, T, i) for i, T in enumerate(held_out)],
+        "circle": [_true_view(simulator, T, i) for i, T in enumerate(circle)],
         "train": spread(frames, settings.train_views) if settings.train_views else [],
     }
+
+
+def _true_view(simulator: Any, T: Any, step: int) -> Any:
+    """What is to be seen at a pose: depth without the sensor's noise and gaps."""
+    from dataclasses import replace
+
+    return replace(simulator.render(T, step=step), depth=simulator.depth(T))
 
 
 def _run_metrics(context: StageContext) -> dict[str, Any]:
@@ -154,7 +163,7 @@ def _write_examples(folder: Path, render: Any, sets: dict, scores: "dict[str, Vi
 
 
 STAGE = Stage(
-    name="evaluation", version=4, config=("evaluation", "scene", "camera", "sensor", "mapping", "run.seed"),
+    name="evaluation", version=5, config=("evaluation", "scene", "camera", "sensor", "motion", "mapping", "run.seed"),
     inputs=_inputs, run=_run, loop=False, parameters=_parameters,
     unkeyed=("scene.file",),
 )

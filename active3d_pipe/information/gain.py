@@ -23,6 +23,8 @@ from active3d_pipe.structures.camera import Camera
 FREE, OPEN, SURFACE = 0, 1, 2
 # A voxel whose rays end in it at least this often is no free space: thin structure fills part of a voxel only.
 THIN_HIT_SHARE = 0.1
+# Uncertainty up to this is none.
+LEAST_LEVEL = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,12 +102,17 @@ def normalised_uncertainty(u_final: np.ndarray, observed: np.ndarray) -> np.ndar
     """U(v) in units of its typical value where nothing was observed, clipped to [0, 2], float32.
 
     The scale of the fused uncertainty follows from the regression that fits it and drifts over a run; weights and
-    thresholds of the planner need one that stays.
+    thresholds of the planner need one that stays. Without the field's term unseen space has no uncertainty of its own:
+    then the scale is what one in twenty observed voxels that have any exceeds.
     """
     u = np.maximum(u_final, 0)
     unseen = u[~observed]
-    level = float(np.median(unseen)) if unseen.size else float(u.max(initial=0.0))
-    if level <= 1e-9:
+    if unseen.size and np.count_nonzero(unseen <= LEAST_LEVEL) <= 0.1 * unseen.size:
+        level = float(np.median(unseen))
+    else:
+        some = u[observed & (u > LEAST_LEVEL)]
+        level = float(np.quantile(some, 0.95)) if some.size else float(u.max(initial=0.0))
+    if level <= LEAST_LEVEL:
         return np.zeros_like(u, dtype=np.float32)
     return np.clip(u / np.float32(level), 0, 2).astype(np.float32)
 

@@ -66,9 +66,14 @@ def horizontal_fov(camera: Camera) -> float:
 
 
 def view_distance(frame: Frame, points_world: np.ndarray, other: Frame) -> float:
-    """d_view in [0, 1]: mean of the viewing-angle difference (in fields of view) and the lack of overlap."""
+    """d_view in [0, 1]: mean of the viewing-angle difference (in fields of view) and the lack of overlap.
+
+    A frame without a reading has no overlap to compare: then the angle alone.
+    """
     angle = se3.rotation_angle(frame.T_world_camera[:3, :3], other.T_world_camera[:3, :3])
     angular = min(angle / horizontal_fov(frame.camera), 1.0)
+    if len(points_world) == 0:
+        return angular
     return 0.5 * angular + 0.5 * (1 - overlap(points_world, other))
 
 

@@ -48,7 +48,7 @@ def update_map(
     with clock.of("keyframes"):
         new = select_keyframes(frames, hybrid.keyframes, volume, round, settings.keyframes)
         hybrid.keyframes += new
-        window = choose_window(hybrid.keyframes, new, settings.window)
+        window = choose_window(hybrid.keyframes, new, frames, settings.window)
 
     factor = settings.first_round_factor if round == 0 else 1.0
     iterations = round_up(

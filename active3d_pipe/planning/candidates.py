@@ -12,8 +12,9 @@ from active3d_pipe.planning.free_space import FreeSpace
 from active3d_pipe.planning.kernels_candidates import best_of_blocks
 from active3d_pipe.structures.camera import Camera
 
-# Rays of the sphere: rows of elevation and twice as many columns of azimuth, 7.5 degrees apart.
-NUM_ELEVATIONS = 24
+# Rays of the sphere: rows of elevation and twice as many columns of azimuth, 7.5 degrees apart; closer together where
+# the image would hold fewer than four rows of them, but never more rows than the most.
+NUM_ELEVATIONS, ROWS_A_VIEW, MOST_ELEVATIONS = 24, 4, 192
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,7 +41,13 @@ class Directions:
 def view_directions(
     camera: Camera, num_yaws: int, pitches_deg: tuple[float, ...], num_elevations: int = NUM_ELEVATIONS
 ) -> Directions:
-    """Level views: `num_yaws` evenly spread times `pitches_deg` (up > 0), on a sphere of rays. Pure, so cached."""
+    """Level views: `num_yaws` evenly spread times `pitches_deg` (up > 0), on a sphere of rays. Pure, so cached.
+
+    `num_elevations`: rows of the sphere for a usual camera; a narrow one has more.
+    """
+    narrow = 2 * math.atan(min(camera.width / camera.fx, camera.height / camera.fy) / 2)
+    least = min(math.ceil(ROWS_A_VIEW * math.pi / narrow), MOST_ELEVATIONS)
+    num_elevations = max(num_elevations, math.ceil(num_elevations / NUM_ELEVATIONS * least))
     num_azimuths = 2 * num_elevations
     azimuth = (np.arange(num_azimuths) + 0.5) * (2 * math.pi / num_azimuths) - math.pi
     edges = np.linspace(-math.pi / 2, math.pi / 2, num_elevations + 1)

@@ -14,6 +14,8 @@ from active3d_pipe.structures.uncertainty_volume import UncertaintyVolume
 from active3d_pipe.structures.voxel_grid import VoxelGrid
 
 UNREACHABLE = 1e29
+# What an agent in a tight spot keeps at least, m.
+LEAST_ESCAPE_M = 1e-3
 # Bits of the half-size cells (4 a + 2 b + c) in the lower and the upper half of a voxel, along x, y, z.
 HALVES = ((0x0F, 0xF0), (0x33, 0xCC), (0x55, 0xAA))
 
@@ -71,9 +73,13 @@ class FreeSpace:
 
 
     def moved_to(self, voxel: np.ndarray, settings: PlanningSettings, longest: float) -> "FreeSpace":
-        """The same space seen from another reachable voxel; costs up to `longest` only."""
+        """The same space seen from another reachable voxel; costs up to `longest` only.
+
+        A small clearance is accepted where the agent already is, not where it will begin its next way.
+        """
         cost, parent = _geodesic(self.risk, self.moves, voxel, settings, longest)
-        return replace(self, start=np.asarray(voxel, dtype=np.int64), cost=cost, parent=parent)
+        start = np.asarray(voxel, dtype=np.int64)
+        return replace(self, start=start, cost=cost, parent=parent, escape_m=self.required_m)
 
 
 def _geodesic(
@@ -116,8 +122,13 @@ def drop_half_seen(free: np.ndarray, passed: np.ndarray) -> None:
 
 
 def mark_body(free: np.ndarray, grid: VoxelGrid, centres_world: np.ndarray, radius_m: float) -> None:
-    """Set `free` in every voxel whose centre lies within the radius of one of the positions (N, 3), in place."""
+    """Set `free` in every voxel whose centre lies within the radius of one of the positions (N, 3), in place.
+
+    And in the voxels that hold the positions, however small the body is.
+    """
     centres = np.ascontiguousarray(centres_world, dtype=np.float64).reshape(-1, 3)
+    own = grid.index_of(centres)
+    free[tuple(own[grid.contains_index(own)].T)] = True
     kernels.mark_spheres(centres, radius_m, np.asarray(grid.origin, dtype=np.float64), grid.voxel_size, free)
 
 
@@ -191,7 +202,8 @@ def begin_free_space(
     position = T_world_camera[:3, 3]
     start = np.clip(grid.index_of(position), 0, np.asarray(grid.shape) - 1)
     passable = clear >= required - 1e-6
-    escape, checked = min(required, float(clear[tuple(start)])), clear
+    # Never nothing: a clearance of zero is met inside walls too.
+    escape, checked = min(required, max(float(clear[tuple(start)]), LEAST_ESCAPE_M)), clear
     if escape < required:
         solid = (volume["hit_evidence"] > 0) & ~free
         checked = _open_escape(passable, clear, solid, grid, position, (required, escape), settings)

@@ -49,17 +49,21 @@ class FreeSpace:
         return float(self.reachable.any(axis=2).sum()) * self.grid.voxel_size**2
 
 
-def reachable_space(sim: Simulator, radius_m: float = 0.2, voxel_m: float = 0.1) -> FreeSpace:
+def reachable_space(
+    sim: Simulator, radius_m: float = 0.2, voxel_m: float = 0.1, *, planar: bool = False
+) -> FreeSpace:
     """Flood fill of free space from the start pose through faces of voxels whose centres are `radius_m` clear.
 
-    The voxel is `voxel_m`, or more where the scene would need over four million. Raises InputError when the start
-    itself is not clear.
+    `planar`: at the height of the start only, as a robot on the ground. The voxel is `voxel_m`, or more where the
+    scene would need over four million. Raises InputError when the start itself is not clear.
     """
     scene = sim.scene
     voxel_m = max(voxel_m, float(np.cbrt(np.prod(scene.bounds_high - scene.bounds_low) / _MAX_CELLS)))
     grid = VoxelGrid.from_bounds(scene.bounds_low, scene.bounds_high, voxel_m)
     clearance = sim.clearance(grid.centres().reshape(-1, 3)).reshape(grid.shape)
     free = clearance > radius_m
+    if planar:
+        free &= np.arange(grid.shape[2]) == grid.index_of(scene.start_pose[:3, 3])[2]
     labels, _ = ndimage.label(free)
     start = scene.start_pose[:3, 3]
     # The start need not fall on a free voxel centre: take the nearest free voxel in a clear line from it.
@@ -142,7 +146,7 @@ def viewpoints(space: FreeSpace, rng: np.random.Generator, spacing_m: float = _V
 
 def observable_points(
     sim: Simulator, points: np.ndarray, rng: np.random.Generator, *, radius_m: float = 0.2,
-    max_range_m: float | None = None, space: FreeSpace | None = None,
+    planar: bool = False, max_range_m: float | None = None, space: FreeSpace | None = None,
 ) -> np.ndarray:
     """(N,) bool, which surface points (N, 3) some reachable pose can see.
 
@@ -151,7 +155,7 @@ def observable_points(
     then from random ones; `rng` draws both.
     """
     points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
-    space = reachable_space(sim, radius_m) if space is None else space
+    space = reachable_space(sim, radius_m, planar=planar) if space is None else space
     reach = sim.camera.far if max_range_m is None else max_range_m
     positions = viewpoints(space, rng)
     seen = np.zeros(len(points), bool)

@@ -106,6 +106,14 @@ def test_uncertainty_is_measured_by_its_level_in_unseen_space():
     np.testing.assert_array_equal(normalised_uncertainty(np.zeros(6, np.float32), observed), 0)
 
 
+def test_without_the_fields_term_uncertainty_is_measured_by_what_was_observed():
+    u = np.concatenate([np.zeros(500), np.full(40, 0.3), np.linspace(0.01, 1.0, 100)]).astype(np.float32)
+    observed = np.arange(640) >= 540
+    found = normalised_uncertainty(u, observed)
+    assert (found[:500] == 0).all() and found[-1] == pytest.approx(1 / 0.95, rel=0.02)
+    np.testing.assert_allclose(found[540:] / found[-1], u[540:], rtol=1e-5)
+
+
 def test_view_quality_prefers_close_and_frontal():
     assert view_quality(1.0, 0.5, 1.0) == 1
     assert view_quality(-1.0, 2.0, 1.0) == pytest.approx(0.5)

@@ -1,5 +1,7 @@
 """A round of mapping on an analytic room: keyframes, window, working set, and the same bytes after a resume."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from room_with_ball import HIGH, LOW, render
@@ -88,12 +90,21 @@ def test_select_keyframes_takes_what_diverges_and_nothing_twice() -> None:
     assert [k.frame.step for k in select_keyframes(frames, [], None, 0, every)] == [0, 5, 10, 15]
 
 
+def test_frames_without_a_reading_are_new_viewpoints_by_their_angle_alone() -> None:
+    blind = [replace(f, depth=np.zeros_like(f.depth)) for f in [*frames_between(0, 1), *frames_between(0, 1) * 5]]
+    assert len(select_keyframes(blind, [], None, 0, SETTINGS.keyframes)) == 1
+
+
 def test_window_holds_the_newest_and_their_neighbours_and_replay_the_others() -> None:
     known = [keyframe(f) for f in frames_between(0, 36, 10.0)]
     settings = SETTINGS.window.model_copy(update={"size": 6})
-    window = choose_window(known, known[-2:], settings)
+    window = choose_window(known, known[-2:], frames_between(34, 36, 10.0), settings)
     # The camera has turned full circle: the neighbours of the last views are the first ones.
     assert {34, 35} <= set(window) and min(window) < 3 and len(window) == 6
+    # A round back where the agent was before adds no keyframe; its neighbours are not the last ones.
+    again = choose_window(known, [], frames_between(16, 19, 10.0), settings)
+    assert len(again) == 6 and all(12 <= i <= 23 for i in again)
+    assert choose_window(known, [], [], settings) == list(range(30, 36))
     older = draw_older(np.random.default_rng(0), window, len(known), settings)
     assert len(older) == 2 and not set(older) & set(window)
     assert draw_older(np.random.default_rng(0), range(len(known)), len(known), settings) == []

@@ -14,6 +14,7 @@ from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.free_space import build_free_space, clearance, drop_half_seen, known_free, mark_body
 from active3d_pipe.planning.kernels_candidates import best_of_blocks, spread_values
 from active3d_pipe.planning.kernels_distance import geodesic, open_moves
+from active3d_pipe.planning.kernels_rrt import FAR, segment_cost
 from active3d_pipe.planning.risk_field import joint_occupancy
 from active3d_pipe.structures import Camera, VoxelGrid
 from active3d_pipe.structures.motion import MotionSettings
@@ -74,6 +75,44 @@ def test_body_is_free():
     near = [np.linalg.norm(grid.centres() - centre, axis=-1) <= 0.2 for centre in (0.5, 0.0)]
     assert (free == near[0] | near[1]).all()
     assert free[0, 0, 0] and not free[9, 9, 9]
+
+
+def test_the_voxel_of_a_tiny_body_is_free():
+    grid = VoxelGrid(np.zeros(3), 0.1, (10, 10, 10))
+    free = np.zeros(grid.shape, bool)
+    mark_body(free, grid, np.array([[0.49, 0.41, 0.45], [-0.5, 0.5, 0.5]]), 0.01)
+    assert np.argwhere(free).tolist() == [[4, 4, 4]]
+
+
+def test_a_tight_start_never_lets_paths_through_what_is_not_free(seen):
+    _, volume, T, walked = seen
+    unknown = replace(volume, arrays=volume.arrays | {"free_evidence": np.zeros_like(volume["free_evidence"])})
+    space = build_free_space(unknown, T, walked, replace_radius(0.05), SETTINGS)
+    assert 0 < space.escape_m < space.required_m
+    start, beside = (space.start + np.float32(0.5)).astype(np.float32), np.array([9.0, 0.0, 0.0], np.float32)
+    escape = (np.float32(space.required_m), np.float32(space.escape_m), start, np.float32(99), np.float32(0.5))
+    assert segment_cost(start, start + beside, np.ones_like(space.checked_m), space.checked_m, *escape) >= FAR
+
+
+def replace_radius(radius_m):
+    return MOTION.model_copy(update={"agent_radius_m": radius_m})
+
+
+def test_the_way_on_from_another_place_keeps_the_whole_clearance(seen):
+    _, volume, T, walked = seen
+    space = replace(build_free_space(volume, T, walked, MOTION, SETTINGS), escape_m=0.1)
+    there = np.argwhere(space.reachable)[-1]
+    assert space.moved_to(there, SETTINGS, 5.0).escape_m == space.required_m
+
+
+@pytest.mark.parametrize("hfov", [3.0, 8.0, 15.0, 90.0])
+def test_views_of_any_camera_hold_rays_of_about_their_solid_angle(hfov):
+    f = 300 / np.tan(np.radians(hfov) / 2)
+    d = view_directions(Camera(600, 340, f, f, 300, 170, 0.1, 10.0), 12, (-60.0, 0.0, 60.0))
+    a, b = 300 / f, 170 / f
+    whole = 4 * np.arcsin(a * b / np.sqrt((1 + a * a) * (1 + b * b)))
+    found = d.members @ d.solid_angles
+    assert (found > 0).all() and found.mean() == pytest.approx(whole, rel=0.25)
 
 
 def test_geodesic_is_no_shorter_than_the_straight_line_and_follows_passable_voxels(seen):

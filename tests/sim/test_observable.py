@@ -7,6 +7,7 @@ from active3d_pipe.sim.check import check_scene
 from active3d_pipe.sim.config import CameraSettings, SceneSettings, SensorSettings
 from active3d_pipe.sim.raycast import RaycastSimulator
 from active3d_pipe.sim.scene import load_scene
+from stages.evaluation import _true_view
 from tests.sim.scenes import FURNITURE, ROOM, Box, Room, write_glb
 
 CLOSET = Box((0.2, 3.0, 0), (1.0, 3.8, 2.0))  # closed on all sides: its inside cannot be seen
@@ -36,6 +37,13 @@ def test_reachable_space_stays_in_the_room_of_the_start(sim, space):
     expected = (sim.clearance(points) > 0.2).mean() * 5 * 4 * 2.6
     inside_closet = 0.4 * 0.4 * 1.6  # clear, but closed
     assert space.volume_m3 == pytest.approx(expected - inside_closet, rel=0.10)
+
+
+def test_a_robot_on_the_ground_reaches_one_height_and_sees_less(sim, space):
+    flat = observable.reachable_space(sim, 0.2, 0.1, planar=True)
+    layers = np.flatnonzero(flat.reachable.any(axis=(0, 1)))
+    assert layers.tolist() == [int(flat.grid.index_of(sim.scene.start_pose[:3, 3])[2])]
+    assert (space.reachable | ~flat.reachable).all()
 
 
 def test_a_sphere_that_fits_nowhere(sim):
@@ -124,3 +132,10 @@ def test_scene_check_warns_of_an_open_scene(tmp_path):
 def test_scene_check_of_a_missing_file():
     with pytest.raises(InputError, match="no such file"):
         check_scene(SceneSettings(file="/nowhere/scene.glb"))
+
+
+def test_views_are_judged_against_depth_without_the_sensors_noise(sim):
+    noisy = RaycastSimulator(sim.scene, sim.camera, SensorSettings(depth_noise_per_m2=0.01, dropout=0.2))
+    view = _true_view(noisy, sim.scene.start_pose, 3)
+    assert (view.depth == sim.depth(sim.scene.start_pose)).all() and (view.depth > 0).mean() > 0.99
+    assert (noisy.render(sim.scene.start_pose, step=3).depth != view.depth).mean() > 0.5
