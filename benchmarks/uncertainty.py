@@ -14,6 +14,7 @@ Runs whose judgement is in OUT already are only read. Numbers are comparable amo
 import argparse
 import pickle
 import time
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -75,13 +76,14 @@ def replay(run: Path, given: argparse.Namespace) -> list[dict]:
     predicted: list[ViewResidual] = []
     spent = {"residuals": 0.0, "volume": 0.0, "steps": 0.0}
     for k, frames in enumerate(rounds):
+        last = None if volume is None else deepcopy(hybrid.field).query_geometry
         update_map(hybrid, frames, volume, k, config.mapping, rng, lambda text: None)
         views = residuals(hybrid, examined_frames(hybrid, frames, volume, settings), settings.render_stride, spent)
         start = time.perf_counter()
         volume = compute_volume(
             grid=grid, round=k, previous=volume, field_query=hybrid.field.query_geometry,
             gaussians=hybrid.gaussians.to_model(copy=False), new_frames=frames, views=views, predicted=predicted,
-            settings=settings,
+            settings=settings, last_field_query=last,
         )
         spent["volume"] += time.perf_counter() - start
         spent["steps"] += len(frames)

@@ -64,7 +64,7 @@ def _run(context: StageContext) -> None:
         view = hybrid.render(camera, T)
         return view.rgb, view.depth, view.alpha
 
-    sets = _view_sets(simulator, frames, settings)
+    sets = _view_sets(simulator, _viewer(config, simulator), frames, settings)
     scores, lpips_source = ev.evaluate_views(
         render, sets, settings, lambda name, done, total: context.progress(f"{name} views {done}/{total}")
     )
@@ -110,8 +110,21 @@ def _curves(context: StageContext, truth: "TruthSurface") -> list[dict[str, Any]
     return points
 
 
-def _view_sets(simulator: Any, frames: list, settings: Any) -> dict[str, list]:
-    """Held-out views at random free poses, the circle protocol, and a sample of the captured frames."""
+def _viewer(config: Any, simulator: Any) -> Any:
+    """The simulator that takes the scored views, at their resolution."""
+    scale, camera = config.evaluation.view_scale, config.camera
+    if scale == 1:
+        return simulator
+    size = {name: max(8, round(scale * getattr(camera, name))) for name in ("width", "height")}
+    smaller = config.model_copy(update={"camera": camera.model_copy(update=size)})
+    return shared.make_simulator(smaller, config.run.seed)
+
+
+def _view_sets(simulator: Any, viewer: Any, frames: list, settings: Any) -> dict[str, list]:
+    """Held-out views at random free poses, the circle protocol, and a sample of the captured frames.
+
+    `simulator` has the agent's camera; `viewer` takes the views, and the captured ones again where it has another.
+    """
     from active3d_pipe.evaluation.views import circle_poses
     from active3d_pipe.sim.observable import held_out_poses
 
@@ -119,10 +132,11 @@ def _view_sets(simulator: Any, frames: list, settings: Any) -> dict[str, list]:
     held_out = held_out_poses(simulator, settings.num_views, scene.name, min_clearance_m=settings.view_clearance_m)
     circle = circle_poses(scene.start_pose[:3, 3], settings.circle_radius_m, settings.circle_views)
     circle = circle[simulator.clearance(circle[:, :3, 3]) >= settings.view_clearance_m]
+    train = spread(frames, settings.train_views) if settings.train_views else []
     return {
-        "heldout": [_true_view(simulator, T, i) for i, T in enumerate(held_out)],
-        "circle": [_true_view(simulator, T, i) for i, T in enumerate(circle)],
-        "train": spread(frames, settings.train_views) if settings.train_views else [],
+        "heldout": [_true_view(viewer, T, i) for i, T in enumerate(held_out)],
+        "circle": [_true_view(viewer, T, i) for i, T in enumerate(circle)],
+        "train": train if viewer is simulator else [_true_view(viewer, f.T_world_camera, f.step) for f in train],
     }
 
 

@@ -64,13 +64,14 @@ def _run(context: StageContext) -> None:
     start = time.perf_counter()
     hybrid = shared.load_map(context.input("mapping", k), context.inputs, config, to_train=False)
     context.timings["reading the map"] = time.perf_counter() - start
-    previous, predicted = None, []
+    previous, predicted, last_field_query = None, [], None
     if k > 0:
         previous = shared.load_volume(context.input("uncertainty", k - 1))
         margin = config.uncertainty.margin_m
         grid = grown_grid(previous.grid, low - margin, high + margin)
         previous = on_grid(previous, grid)
         before = shared.load_map(context.input("mapping", k - 1), context.inputs, config, to_train=False)
+        last_field_query = before.field.query_geometry
         ahead = frames[:: config.uncertainty.predict_every]
         predicted = residuals(before, ahead, config.uncertainty.render_stride, context.timings, of_field=True)
     examined = examined_frames(hybrid, frames, previous, config.uncertainty)
@@ -79,7 +80,7 @@ def _run(context: StageContext) -> None:
     volume = compute_volume(
         grid=grid, round=k, previous=previous, field_query=hybrid.field.query_geometry,
         gaussians=hybrid.gaussians.to_model(copy=False), new_frames=frames, views=views, predicted=predicted,
-        settings=config.uncertainty,
+        settings=config.uncertainty, last_field_query=last_field_query,
     )
     context.timings["volume"] = time.perf_counter() - start
     shared.save_volume(context.out, volume)
@@ -111,6 +112,6 @@ def _write_surface(context: StageContext, hybrid: "HybridMap", volume: "Uncertai
 
 
 STAGE = Stage(
-    name="uncertainty", version=9, config=("uncertainty", "mapping", "export.preview_voxel_m"),
+    name="uncertainty", version=10, config=("uncertainty", "mapping", "export.preview_voxel_m"),
     inputs=_inputs, run=_run, loop=True,
 )

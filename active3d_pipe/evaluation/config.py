@@ -30,6 +30,7 @@ class EvaluationSettings(Settings):
     circle_views: int = Field(60, ge=0, description="views on the inward-looking circle (second protocol); 0 = none")
     circle_radius_m: float = Field(1.0, gt=0, description="radius of that circle, m")
     train_views: int = Field(20, ge=0, description="captured frames that are scored too, to show the gap; 0 = none")
+    view_scale: float = Field(1.0, gt=0, le=1, description="resolution of the scored views, 1 = the camera's")
     ms_ssim: bool = Field(True, description="compute MS-SSIM beside plain SSIM")
     lpips: str = Field(
         "auto",

@@ -1,6 +1,7 @@
 """The uncertainty volume of one round: the algorithm on one page (paper, sec. uncertainty_map)."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.ndimage import maximum_filter
@@ -34,6 +35,7 @@ def compute_volume(  # noqa: PLR0913  (the inputs of the stage, by name)
     views: Sequence[ViewResidual],
     predicted: Sequence[ViewResidual],
     settings: UncertaintySettings,
+    last_field_query: FieldQuery | None = None,
 ) -> UncertaintyVolume:
     """Volume of round `round` from the map of this round and everything that was observed so far.
 
@@ -50,6 +52,8 @@ def compute_volume(  # noqa: PLR0913  (the inputs of the stage, by name)
         new_frames: frames captured since `previous`.
         views: renderings of keyframes with this round's map against their images.
         predicted: renderings of the *previous* map at the poses of new frames, against those frames.
+        last_field_query: the field of the previous round, for S_{t-1} of the temporal term in voxels that were not
+            asked about then and are now. Without it their SDF of some earlier round stands in.
 
     Raises:
         InputError: `previous` is on another grid, or `field_query` returns the wrong number of values.
@@ -60,7 +64,12 @@ def compute_volume(  # noqa: PLR0913  (the inputs of the stage, by name)
     fresh = integrate_depth(grid, new_frames, settings)
     evidence = before.joined(fresh)
 
-    geometry = _query(grid, field_query, previous, open_to_the_field(evidence, settings))
+    asked = open_to_the_field(evidence, settings)
+    if previous is not None and last_field_query is not None:
+        late = asked & ~open_to_the_field(before, settings)
+        sdf = _query(grid, last_field_query, previous, late)[0]
+        previous = replace(previous, arrays={**previous.arrays, "sdf": sdf})
+    geometry = _query(grid, field_query, previous, asked)
     vain = looks_in_vain(grid, new_frames, evidence.hit > 0, settings)
     if previous is not None:
         vain = vain + previous["vain_looks"]
