@@ -58,7 +58,9 @@ def inspect(
     data: UncertaintyVolume = read_volume(store.folder(node) / "volume.zarr")
     cut = parse_slice(slice_, data.grid)
     document = describe(data, volume, cut)
-    png = out or run.with_name(f"{run.resolve().name}_{volume}_round_{node.round:04d}_{cut.axis}{cut.metres:.2f}.png")
+    whole = run.resolve()
+    name = f"{whole.name}_{volume}_round_{node.round:04d}_{cut.axis}{cut.metres:.2f}.png"
+    png = out or whole.with_name(name)
     draw(data, volume, cut, png)
     document["picture"] = str(png)
     if json:

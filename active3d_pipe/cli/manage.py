@@ -20,7 +20,7 @@ def fork(
     from active3d_pipe.pipeline.run_dir import RUN_TOML
 
     runner = session.open_run(run)
-    target = to or run.with_name(f"{run.resolve().name}_fork_{round}")
+    target = to or run.resolve().with_name(f"{run.resolve().name}_fork_{round}")
     config = with_values(load_run_config(run / RUN_TOML, Config, set_), run={"name": target.resolve().name})
     made = make_fork(runner, round, target, config, resolve_toml(config))
     changes = session.changed_settings(runner.config, config)

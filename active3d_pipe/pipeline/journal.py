@@ -84,6 +84,6 @@ def spent(events: Iterable[dict[str, Any]]) -> dict[NodeId, Spent]:
         try:
             node = parse_node(event["node"])
             found[node] = Spent(float(event["seconds"] or 0), dict(event.get("timings") or {}), str(event["content"]))
-        except (KeyError, TypeError, ValueError):
+        except (AttributeError, KeyError, TypeError, ValueError):
             continue
     return found

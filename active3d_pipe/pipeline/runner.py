@@ -87,6 +87,7 @@ class Runner:
         with RunLock(self.run_dir.path), StopRequest() as stop:
             self._recover()
             self._warn_of_stale_inputs(nodes, last)
+            self.surveyor.deep = True
             for node in nodes:
                 state = self.surveyor.assess(node, last)
                 if state.state is State.UNKNOWN:
@@ -237,6 +238,11 @@ class Runner:
             if last < 0 or last > self.surveyor.last_round_on_disk() + 1:
                 raise ConfigError(
                     f"--round {last}: the run has rounds 0 to {self.surveyor.last_round_on_disk()}"
+                )
+            if not self.registry.stage(names[end]).loop and last < self.last_whole_round():
+                raise ConfigError(
+                    f"--until {names[end]}: is made of all rounds, not of those up to --round {last}; go on with "
+                    f"`active3d run-stage {names[end]}`, or `active3d fork` for another end"
                 )
         nodes = [NodeId(n, last if self.registry.stage(n).loop else None) for n in chosen]
         for wanted in self.surveyor.inputs(nodes[0], last):

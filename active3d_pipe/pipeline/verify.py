@@ -29,8 +29,8 @@ def verify(runner: Runner, deep: bool) -> Verified:
     remarks = [f"journal.jsonl: {torn} line(s) torn by a crash"] if torn else []
     found: list[str] = []
     artifacts = files = size = 0
-    removed = {str(event.get("node")) for event in events if event["event"] == "remove"}
-    expected = {node for node in spent(events) if str(node) not in removed}
+    newest = {str(e.get("node")): e["event"] for e in events if e["event"] in ("commit", "remove")}
+    expected = {node for node in spent(events) if newest[str(node)] == "commit"}
     on_disk = {NodeId(s.name, k) for s in registry.loop for k in store.rounds(s.name)}
     on_disk |= {node for node in registry.finish_nodes() if store.folder(node).exists()}
     known = {stage.name for stage in registry.stages}

@@ -31,18 +31,25 @@ def write_mesh_glb(path: Path, mesh: TriangleMesh) -> None:
 
 
 def read_mesh(path: Path) -> TriangleMesh:
-    """Read a PLY mesh written by `write_mesh_ply`."""
+    """Read a PLY mesh written by `write_mesh_ply`; one without faces has no vertices either."""
     import trimesh
 
     with reading(path, "a PLY mesh"):
         if not path.is_file():
             raise FileNotFoundError(path)
+        if b"element face 0\n" in _header(path):
+            return TriangleMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8))
         mesh: Any = trimesh.load(path, process=False)
         if not isinstance(mesh, trimesh.Trimesh):
             raise ArtifactError(f"{path}: holds no triangles")
         visual: Any = mesh.visual
         colors = np.asarray(visual.vertex_colors)[:, :3].astype(np.uint8)
         return TriangleMesh(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32), colors)
+
+
+def _header(path: Path) -> bytes:
+    with open(path, "rb") as f:
+        return f.read(1024).partition(b"end_header")[0].replace(b"\r", b"")
 
 
 def _to_trimesh(mesh: TriangleMesh) -> "trimesh.Trimesh":

@@ -74,6 +74,19 @@ def test_verify_finds_a_missing_artifact_and_a_strange_file(run_path: Path) -> N
     )
 
 
+def test_verify_misses_what_was_removed_once_and_made_again(run_path: Path) -> None:
+    runner, node = open_runner(run_path), NodeId("planning", 1)
+    line = next(e for e in runner.run_dir.journal.read()[0] if e["event"] == "commit" and e["node"] == str(node))
+    removed = {**line, "event": "remove"}
+    shutil.rmtree(run_path / "planning/round_0001")
+    with open(run_path / "journal.jsonl", "a", encoding="utf-8") as journal:
+        journal.write(json.dumps(removed) + "\n")
+    assert not verify(open_runner(run_path), deep=True).damage
+    with open(run_path / "journal.jsonl", "a", encoding="utf-8") as journal:
+        journal.write(json.dumps(line) + "\n")
+    assert verify(open_runner(run_path), deep=True).damage == ("planning/round_0001: is missing",)
+
+
 @pytest.mark.parametrize("how", ["truncate", "delete", "extend"])
 def test_run_heals_damage_that_sizes_show(run_path: Path, finished: Path, how: str) -> None:
     _damage(run_path / "mapping/round_0001/state.npy", how, random.Random(1))

@@ -66,6 +66,18 @@ def test_run_stage_until_runs_the_stages_between(run_path: Path) -> None:
     ]
     with pytest.raises(ConfigError, match="--until capture: comes before mapping; the order is capture, mapping"):
         open_runner(run_path).run_stage("mapping", 2, until="capture")
+    with pytest.raises(ConfigError, match="--until export: is made of all rounds, not of those up to --round 0"):
+        open_runner(run_path).run_stage("planning", 0, until="export")
+
+
+def test_run_stage_makes_again_what_was_damaged_without_changing_its_size(run_path: Path) -> None:
+    runner = open_runner(run_path)
+    folder = runner.run_dir.store.folder(NodeId("export"))
+    file = next(p for p in sorted(folder.iterdir()) if p.name != "record.json" and p.stat().st_size)
+    intact = file.read_bytes()
+    file.write_bytes(bytes([intact[0] ^ 1]) + intact[1:])
+    assert runner.run_stage("export").executed == (NodeId("export"),)
+    assert file.read_bytes() == intact
 
 
 def test_run_stage_in_a_new_run_goes_step_by_step(finished: Path, tmp_path: Path) -> None:

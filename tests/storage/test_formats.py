@@ -157,6 +157,13 @@ def test_mesh_round_trip_and_glb_stands_upright(tmp_path: Path) -> None:
     np.testing.assert_allclose(high - low, [1, 2, 1], atol=1e-6)  # height along glTF's y
 
 
+def test_an_empty_mesh_comes_back_empty(tmp_path):
+    nothing = TriangleMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8))
+    meshes.write_mesh_ply(tmp_path / "m.ply", nothing)
+    back = meshes.read_mesh(tmp_path / "m.ply")
+    assert back.vertices.shape == back.faces.shape == back.colors.shape == (0, 3)
+
+
 def test_tensors_round_trip_same_bytes_and_damage(tmp_path: Path) -> None:
     tensors = {"b": np.arange(5, dtype=np.float32), "a": np.ones((2, 3), np.int64), "scalar": np.array(2.0)}
     files.write_tensors(tmp_path / "t1", tensors, {"step": 3, "names": ["x"]})

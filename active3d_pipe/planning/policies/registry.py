@@ -104,5 +104,5 @@ def _load(name: str) -> Any:
     module, _, attribute = path.partition(":")
     try:
         return getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, SyntaxError, ValueError) as error:
         raise ConfigError(f"planning.policy = {name!r}: cannot be loaded ({error}); expected module:Class") from error
