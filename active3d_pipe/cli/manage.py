@@ -15,13 +15,12 @@ def fork(
     json: bool = session.JSON,
 ) -> None:
     """Begin a new run with the first rounds of another: another future from the same past."""
-    from active3d_pipe.pipeline.config import Config, load_run_config, resolve_toml, with_values
+    from active3d_pipe.pipeline.config import resolve_toml, with_values
     from active3d_pipe.pipeline.fork import fork as make_fork
-    from active3d_pipe.pipeline.run_dir import RUN_TOML
 
     runner = session.open_run(run)
     target = to or run.resolve().with_name(f"{run.resolve().name}_fork_{round}")
-    config = with_values(load_run_config(run / RUN_TOML, Config, set_), run={"name": target.resolve().name})
+    config = with_values(session.run_config(run, set_), run={"name": target.resolve().name})
     made = make_fork(runner, round, target, config, resolve_toml(config))
     changes = session.changed_settings(runner.config, config)
     if json:

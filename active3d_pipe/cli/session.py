@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 if TYPE_CHECKING:
+    from active3d_pipe.pipeline.config import Config
     from active3d_pipe.pipeline.events import Watcher
     from active3d_pipe.pipeline.graph import Registry
     from active3d_pipe.pipeline.layers import Layers
@@ -57,12 +58,23 @@ def open_run(path: Path, overrides: Sequence[str] = (), watch: "Watcher | None" 
     layers.merge(read_toml(path / RUN_TOML), str(path / RUN_TOML))
     use_threads(layers)
 
-    from active3d_pipe.pipeline.config import Config, load_run_config
     from active3d_pipe.pipeline.runner import Runner
 
-    config = load_run_config(path / RUN_TOML, Config, overrides)
+    config = run_config(path, overrides)
     run_folder = path
     return Runner(run_dir, registry(), config, watch if watch is not None else watcher(config.run.steps))
+
+
+def run_config(path: Path, overrides: Sequence[str]) -> "Config":
+    """The configuration of a run folder with `--set` texts on top, another scene found as `run` finds it."""
+    from active3d_pipe.cli.scene_files import with_scene
+    from active3d_pipe.pipeline.config import Config, load_run_config
+    from active3d_pipe.pipeline.run_dir import RUN_TOML
+
+    config = load_run_config(path / RUN_TOML, Config, overrides)
+    if any(text.partition("=")[0].strip() == "scene.file" for text in overrides):
+        return with_scene(config, None)
+    return config
 
 
 def write_config(runner: "Runner") -> None:

@@ -1,8 +1,8 @@
 """Knobs of the simulated world: which scene, which camera, how good its depth sensor is."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from active3d_pipe.structures import Camera, Settings
 
@@ -36,6 +36,12 @@ class CameraSettings(Settings):
     hfov_deg: float = Field(90.0, gt=1, lt=170, description="horizontal field of view, degrees")
     near: float = Field(0.05, ge=0, description="shortest depth that counts as a reading, m")
     far: float = Field(10.0, gt=0, description="longest depth that counts as a reading, m")
+
+    @model_validator(mode="after")
+    def _check_range(self) -> Self:
+        if self.near >= self.far:
+            raise ValueError(f"near = {self.near:g} and far = {self.far:g}: expected near < far")
+        return self
 
     def camera(self) -> Camera:
         """The intrinsics: square pixels, principal point in the middle of the image."""

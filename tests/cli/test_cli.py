@@ -111,6 +111,26 @@ def test_run_stage(call, run: Path) -> None:
     assert out == "mapping/round_0001  miss  stale  forced\n1 of 1 would run\n"
 
 
+@pytest.mark.parametrize("arguments", [
+    ("run-stage", "mapping", "--round", 99, "--set", "run.seed=4"),
+    ("resume", "--set", "camera.near=20"),
+    ("resume", "--set", "scene.file=nowhere.glb"),
+])
+def test_a_refused_command_leaves_no_trace(call, run: Path, arguments: tuple) -> None:
+    before = snapshot(run)
+    name, *rest = arguments
+    code, _, err = call(name, *rest[:1], "--run", run, *rest[1:]) if name == "run-stage" else call(name, run, *rest)
+    assert code in (2, 3) and len(err.strip().splitlines()) == 1
+    assert snapshot(run) == before
+    assert call("resume", run)[0] == 0
+
+
+def test_another_scene_is_stored_as_a_path_that_lasts(call, run: Path, tmp_path: Path) -> None:
+    (tmp_path / "other.glb").touch()
+    assert call("resume", run, "--set", "scene.file=other.glb")[0] == 0
+    assert f'file = "{tmp_path / "other.glb"}"' in (run / "run.toml").read_text()
+
+
 @pytest.mark.parametrize("command", ["status", "verify", "gc", "evaluate", "report", "resume"])
 def test_json_is_one_document(call, run: Path, command: str) -> None:
     code, out, _ = call(command, run, "--json")
