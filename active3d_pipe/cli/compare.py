@@ -163,7 +163,8 @@ def write_tables(sweep: "Sweep") -> list[Path]:
     for cell in sweep.cells:
         ended = sweep.state(cell)
         error = ended.error if ended is not None and ended.state == "failed" else ""
-        results.append(read_result(cell.scene, cell.variant, cell.seed, cell.folder(sweep.out), error))
+        outdated = sweep.is_outdated(cell)
+        results.append(read_result(cell.scene, cell.variant, cell.seed, cell.folder(sweep.out), error, outdated))
     labels = {v.name: v.label for v in sweep.spec.variants}
     try:
         metrics = tables.chosen_metrics(sweep.spec.metrics)

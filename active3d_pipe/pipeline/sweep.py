@@ -63,8 +63,11 @@ class Cell:
 
     @property
     def key(self) -> str:
-        """Digest of everything that was asked for."""
-        return digest(asdict(self))
+        """Digest of everything that was asked for, the text of a configuration file included."""
+        asked = asdict(self)
+        if self.base.endswith(".toml") and Path(self.base).is_file():
+            asked["base_text"] = Path(self.base).read_text(encoding="utf-8")
+        return digest(asked)
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,10 +138,13 @@ def make_variant(entry: Any, variant_of: Callable[[str], Mapping[str, Any]], whe
 
 def checked(spec: Spec) -> Spec:
     """The spec itself; ConfigError when two runs would share a folder."""
-    for what, names in (("variant", [v.name for v in spec.variants]), ("scene", [scene_name(s) for s in spec.scenes])):
+    for what, names in (
+        ("variant", [v.name for v in spec.variants]), ("scene", [scene_name(s) for s in spec.scenes]),
+        ("seed", [str(s) for s in spec.seeds]),
+    ):
         twice = sorted({n for n in names if names.count(n) > 1})
         if twice:
-            raise ConfigError(f"{what} {twice[0]!r} is given twice; every {what} needs a name of its own")
+            raise ConfigError(f"{what} {twice[0]!r} is given twice; every {what} needs a folder of its own")
     return spec
 
 
@@ -166,6 +172,11 @@ class Sweep:
         """How the run ended, or None when it did not yet (or was asked for with other settings)."""
         ended = self.ended.get(self._name(cell))
         return ended if ended is not None and ended.key == cell.key else None
+
+    def is_outdated(self, cell: Cell) -> bool:
+        """Whether the run in its folder was asked for with other settings: no result of this sweep."""
+        ended = self.ended.get(self._name(cell))
+        return ended is not None and ended.key != cell.key
 
     def run(
         self, execute: Callable[[Cell, Path], str], say: Callable[[str], None], is_complete: Callable[[Path], bool],

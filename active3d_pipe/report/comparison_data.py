@@ -18,12 +18,17 @@ def is_complete(run: Path) -> bool:
     return (run / METRICS_FILE).is_file()
 
 
-def read_result(scene: str, variant: str, seed: int, run: Path, error: str = "") -> Result:
-    """What a run folder says; state `failed` with the error given, `missing` when there is no evaluation yet."""
+def read_result(
+    scene: str, variant: str, seed: int, run: Path, error: str = "", outdated: bool = False
+) -> Result:
+    """What a run folder says; state `failed` with the error given, `missing` when there is no evaluation yet.
+
+    Nor is there one when the run is `outdated`: made with other settings than are asked for.
+    """
     nothing = np.zeros((0, 3))
     if error:
         return Result(scene, variant, seed, "failed", {}, nothing, error)
-    if not is_complete(run):
+    if outdated or not is_complete(run):
         return Result(scene, variant, seed, "missing", {}, nothing)
     metrics = {
         name: float(value) for name, value in _json(run / METRICS_FILE)["metrics"].items() if _is_number(value)

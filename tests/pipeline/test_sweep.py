@@ -1,3 +1,4 @@
+from dataclasses import replace
 from threading import Barrier
 
 import pytest
@@ -127,3 +128,27 @@ def test_other_settings_or_a_lost_folder_run_again(spec, tmp_path):
     (tmp_path / "room/a/seed_0/done").unlink()
     ran, *_ = drive(replace(spec, settings=("run.steps=6",)), tmp_path)
     assert ran == ["room/a/seed_0"]
+
+
+def test_a_run_made_with_other_settings_is_no_result(spec, tmp_path):
+    drive(spec, tmp_path)
+    other = s.Sweep(tmp_path, replace(spec, settings=(*spec.settings, "run.steps=999")))
+    assert all(other.is_outdated(c) and other.state(c) is None for c in other.cells)
+    same = s.Sweep(tmp_path, spec)
+    assert not any(same.is_outdated(c) for c in same.cells)
+    new = s.Sweep(tmp_path / "nothing_yet", spec)
+    assert not any(new.is_outdated(c) for c in new.cells)
+
+
+def test_the_text_of_the_base_belongs_to_what_was_asked_for(spec, tmp_path):
+    base = tmp_path / "base.toml"
+    base.write_text("[run]\nsteps = 24\n")
+    cell = s.cells(replace(spec, base=str(base)))[0]
+    before = cell.key
+    base.write_text("[run]\nsteps = 2400\n")
+    assert cell.key != before
+
+
+def test_a_seed_counts_once(spec):
+    with pytest.raises(ConfigError, match="seed '0' is given twice"):
+        s.checked(replace(spec, seeds=(0, 1, 0)))
