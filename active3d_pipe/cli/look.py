@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from active3d_pipe.pipeline.status import Status
     from active3d_pipe.structures import UncertaintyVolume
 
+PICTURES = (".png", ".jpg", ".svg", ".pdf")
+
 
 def status(run: Path = session.RUN, json: bool = session.JSON) -> None:
     """What a run holds: rounds, steps, seconds and bytes of every stage, what is stale, missing or pruned."""
@@ -61,6 +63,8 @@ def inspect(
     whole = run.resolve()
     name = f"{whole.name}_{volume}_round_{node.round:04d}_{cut.axis}{cut.metres:.2f}.png"
     png = out or whole.with_name(name)
+    if png.suffix.lower() not in PICTURES:
+        raise ConfigError(f"--out {png}: expected a picture's name, ending in {', '.join(PICTURES)}")
     draw(data, volume, cut, png)
     document["picture"] = str(png)
     if json:

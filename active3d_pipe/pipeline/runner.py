@@ -8,6 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from pydantic import ValidationError
+
 from active3d_pipe.errors import ArtifactError, ConfigError
 from active3d_pipe.pipeline.events import Done, Silent, Watcher
 from active3d_pipe.pipeline.execute import Executor
@@ -53,7 +55,14 @@ class Runner:
         self.config = config
         self.watcher = watcher or Silent()
         lineage = (manifest or run_dir.manifest()).lineage
-        past = [(old.until_round, type(config).model_validate(old.config)) for old in lineage]
+        try:
+            past = [(old.until_round, type(config).model_validate(old.config)) for old in lineage]
+        except ValidationError as error:
+            wrong = ".".join(map(str, error.errors()[0]["loc"]))
+            raise ArtifactError(
+                f"{run_dir.path}/manifest.json: {wrong} of the run that this one was forked from is not known to this "
+                "version; go on with the version that made it"
+            ) from error
         self.surveyor = Surveyor(run_dir.store, registry, config, past)
         self.executor = Executor(self.surveyor, run_dir.journal, self.watcher)
         self._executed: list[NodeId] = []

@@ -303,6 +303,19 @@ def test_inspect_draws_a_volume(call, run: Path, tmp_path: Path) -> None:
     assert call("inspect", run, "--slice", "z=9")[2] == "active3d: --slice z=9: the volume spans z = 0.00 to 2.50 m\n"
     assert "expected an axis and metres" in call("inspect", run, "--slice", "w=1")[2]
     assert "there is no volume of that round; there are 0 to 2" in call("inspect", run, "--round", "7")[2]
+    code, _, err = call("inspect", run, "--out", "s.foo")
+    assert code == 2 and "expected a picture's name, ending in .png" in err
+    os.chdir(run)
+    assert call("inspect", ".")[0] == 0
+    assert call("fork", ".", "--round", "0")[0] == 0 and (run.parent / "r_fork_0").is_dir()
+
+
+def test_a_fork_of_a_run_with_unknown_settings_says_so(call, run: Path) -> None:
+    assert call("fork", run, "--round", 0, "--to", run.with_name("f"))[0] == 0
+    manifest = run.with_name("f") / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"steps": 10', '"stepz": 10', 1))
+    code, _, err = call("status", run.with_name("f"))
+    assert code == 3 and "not known to this version" in err
 
 
 @pytest.mark.parametrize(("value", "text"), [(0, "0 B"), (999, "999 B"), (12_345, "12.3 kB"), (5e9, "5.0 GB")])
