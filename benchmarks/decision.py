@@ -98,7 +98,7 @@ def decide_again(run: FinishedRun, k: int, repeats: int) -> dict[str, float]:
             volume = watch.wrapped(volumes.compute_volume, "volume: terms, fusion, entropy")(
                 grid=before.grid, round=k, previous=before, field_query=hybrid.field.query_geometry,
                 gaussians=hybrid.gaussians.to_model(copy=False), new_frames=frames, views=views, predicted=predicted,
-                settings=settings,
+                settings=settings, last_field_query=hybrid.field.query_geometry,
             )
             watch.wrapped(decide.decide, "choice, and waiting for distances")(
                 volume, walked[-1], walked, camera, config.motion, config.planning, np.random.default_rng(0),

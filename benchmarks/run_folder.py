@@ -74,5 +74,4 @@ class FinishedRun:
         from active3d_pipe.sim.observable import observable_points
 
         rng, motion = np.random.default_rng(self.config.evaluation.seed), self.config.motion
-        planar = motion.model == "ground"
-        return observable_points(self.simulator, points, rng, radius_m=motion.agent_radius_m, planar=planar)
+        return observable_points(self.simulator, points, rng, radius_m=motion.agent_radius_m, planar=motion.planar)

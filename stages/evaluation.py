@@ -52,8 +52,7 @@ def _run(context: StageContext) -> None:
     def observable(points: np.ndarray) -> np.ndarray:
         # Seeded by the evaluation, not by the run: every run of such an agent is judged on the same points.
         rng, motion = np.random.default_rng(settings.seed), config.motion
-        planar = motion.model == "ground"
-        return observable_points(simulator, points, rng, radius_m=motion.agent_radius_m, planar=planar)
+        return observable_points(simulator, points, rng, radius_m=motion.agent_radius_m, planar=motion.planar)
 
     truth = prepare_truth(scene.surface, settings, observable)
     context.progress("geometry")
@@ -69,10 +68,11 @@ def _run(context: StageContext) -> None:
         render, sets, settings, lambda name, done, total: context.progress(f"{name} views {done}/{total}")
     )
     metrics |= ev.view_metrics(scores)
-    metrics |= _run_metrics(context)
+    logs = [shared.read_capture(context.input("capture", k)) for k in range(context.last_round + 1)]
+    metrics |= _run_metrics(logs)
     _write_examples(context.out / "examples", render, sets, scores, settings.example_views)
 
-    curves = _curves(context, thinned_truth(truth, settings.curve_points)) if settings.curve_points else []
+    curves = _curves(context, logs, thinned_truth(truth, settings.curve_points)) if settings.curve_points else []
     write_json(context.out / "curves.json", curves)
     (context.out / "curves.csv").write_text(ev.rows_to_csv(curves), encoding="utf-8")
     rows = ev.summary_rows(metrics)
@@ -90,7 +90,7 @@ def _run(context: StageContext) -> None:
     context.notes.update({k: metrics[k] for k in headline if metrics.get(k) is not None})
 
 
-def _curves(context: StageContext, truth: "TruthSurface") -> list[dict[str, Any]]:
+def _curves(context: StageContext, logs: list[dict], truth: "TruthSurface") -> list[dict[str, Any]]:
     """Completion and accuracy of the surface of every sampled round, by steps and walked metres."""
     from itertools import accumulate
 
@@ -98,7 +98,6 @@ def _curves(context: StageContext, truth: "TruthSurface") -> list[dict[str, Any]
     from active3d_pipe.storage import meshes
 
     settings = context.config.evaluation
-    logs = [shared.read_capture(context.input("capture", k)) for k in range(context.last_round + 1)]
     walked = list(accumulate(d["path_length_m"] for d in logs))
     points = []
     for node, folder in context.inputs.items():
@@ -111,13 +110,14 @@ def _curves(context: StageContext, truth: "TruthSurface") -> list[dict[str, Any]
 
 
 def _viewer(config: Any, simulator: Any) -> Any:
-    """The simulator that takes the scored views, at their resolution."""
+    """The simulator that takes the scored views, at their resolution; of the scene that is open."""
+    from active3d_pipe.sim.simulator import open_simulator
+
     scale, camera = config.evaluation.view_scale, config.camera
     if scale == 1:
         return simulator
     size = {name: max(8, round(scale * getattr(camera, name))) for name in ("width", "height")}
-    smaller = config.model_copy(update={"camera": camera.model_copy(update=size)})
-    return shared.make_simulator(smaller, config.run.seed)
+    return open_simulator(simulator.scene, camera.model_copy(update=size), config.sensor, config.run.seed)
 
 
 def _view_sets(simulator: Any, viewer: Any, frames: list, settings: Any) -> dict[str, list]:
@@ -147,10 +147,9 @@ def _true_view(simulator: Any, T: Any, step: int) -> Any:
     return replace(simulator.render(T, step=step), depth=simulator.depth(T))
 
 
-def _run_metrics(context: StageContext) -> dict[str, Any]:
-    logs = [shared.read_capture(context.input("capture", k)) for k in range(context.last_round + 1)]
+def _run_metrics(logs: list[dict]) -> dict[str, Any]:
     return {
-        "steps": sum(len(d["poses"]) for d in logs), "rounds": context.last_round + 1,
+        "steps": sum(len(d["poses"]) for d in logs), "rounds": len(logs),
         "collisions": sum(d["collisions"] for d in logs),
         "path_m": round(sum(d["path_length_m"] for d in logs), 3),
         "min_clearance_m": min(d["min_clearance_m"] for d in logs),

@@ -68,7 +68,7 @@ def run_stage(
         _print_plan(runner.dry_run(stage, round, force=force, until=until), json)
         return
     # What is refused must leave no trace: the selection is checked before changed settings are written.
-    runner.dry_run(stage, round, force=force, until=until)
+    runner.selection(stage, round, until)
     session.write_config(runner)
     outcome = _closing(runner, lambda: runner.run_stage(stage, round, force=force, until=until))
     if json:

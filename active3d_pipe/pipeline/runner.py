@@ -71,7 +71,6 @@ class Runner:
         """Explore to the end and finish; goes on where an earlier call stopped."""
         with RunLock(self.run_dir.path), StopRequest() as stop:
             self._recover()
-            self.surveyor.deep = True
             k = 0
             while True:
                 before = len(self._executed)
@@ -92,13 +91,12 @@ class Runner:
         self, name: str, round: int | None = None, *, force: bool = False, until: str | None = None
     ) -> Outcome:
         """Run one stage of one round if its key changed (or always, with `force`); `until` goes on to a later stage."""
-        nodes, last = self._selection(name, round, until)
+        nodes, last = self.selection(name, round, until)
         with RunLock(self.run_dir.path), StopRequest() as stop:
             self._recover()
             self._warn_of_stale_inputs(nodes, last)
-            self.surveyor.deep = True
             for node in nodes:
-                state = self.surveyor.assess(node, last)
+                state = self.surveyor.assess(node, last, deep=True)
                 if state.state is State.UNKNOWN:
                     self.surveyor.parts(node, last)  # raises what made it unknown
                 if not force and state.state.is_hit and state.record is not None:
@@ -116,7 +114,7 @@ class Runner:
         if name is None:
             last = self.last_round()
             return Outcome(self.ended(last), last, plan=tuple(self.surveyor.survey(last).values()))
-        nodes, last = self._selection(name, round, until)
+        nodes, last = self.selection(name, round, until)
         plan: list[NodeState] = []
         for node in nodes:
             waiting = [s.node for s in plan if not s.state.is_hit and s.node in self.surveyor.inputs(node, last)]
@@ -196,7 +194,7 @@ class Runner:
             self.prune(record)
 
     def _ensure(self, node: NodeId, last_round: int, stop: StopRequest) -> None:
-        state = self.surveyor.assess(node, last_round)
+        state = self.surveyor.assess(node, last_round, deep=True)
         if state.state is State.UNKNOWN:
             self.surveyor.parts(node, last_round)  # raises what made it unknown
         if state.state.is_hit and state.record is not None:
@@ -226,8 +224,8 @@ class Runner:
         except ArtifactError:
             return None
 
-    def _selection(self, name: str, round: int | None, until: str | None) -> tuple[list[NodeId], int]:
-        """The nodes that `run_stage` is about, and the last round."""
+    def selection(self, name: str, round: int | None, until: str | None) -> tuple[list[NodeId], int]:
+        """The nodes that `run_stage` is about, and the last round; ConfigError or ArtifactError where it is refused."""
         stage = self.registry.stage(name)
         names = [s.name for s in self.registry.stages]
         end = names.index(self.registry.stage(until).name) if until else names.index(name)

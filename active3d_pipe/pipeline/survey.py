@@ -54,9 +54,6 @@ class Surveyor:
         self._lineage = sorted(lineage, key=lambda past: past[0])
         self._subsets: dict[tuple[str, int], dict[str, Any]] = {}
         self._contents: dict[NodeId, tuple[Record, str]] = {}
-        # With `deep`, every byte is hashed once before a node counts as up to date: damage that leaves sizes as
-        # they were is found too, and before anything (a stage's `parameters` hook, say) reads it.
-        self.deep = False
         self._whole: set[NodeId] = set()
 
     def config_of(self, node: NodeId) -> Any:
@@ -111,13 +108,17 @@ class Surveyor:
             self._parameters(node, stage, config, {name: self.store.folder(name) for name in inputs}), contents,
         )
 
-    def assess(self, node: NodeId, last_round: int) -> NodeState:
-        """The state of one node, its inputs taken as they are on disk."""
+    def assess(self, node: NodeId, last_round: int, *, deep: bool = False) -> NodeState:
+        """The state of one node, its inputs taken as they are on disk.
+
+        With `deep`, every byte is hashed once before the node counts as up to date: damage that leaves sizes as they
+        were is found too, and before anything (a stage's `parameters` hook, say) reads it.
+        """
         try:
             record = self.record(node)
         except ArtifactError as error:
             return NodeState(node, State.DAMAGED, (str(error),))
-        if record is not None and self.deep and node not in self._whole and not self.store.is_pruned(node):
+        if record is not None and deep and node not in self._whole and not self.store.is_pruned(node):
             wrong = damage(self.store.folder(node), record, deep=True)
             if wrong:
                 return NodeState(node, State.DAMAGED, tuple(wrong), record)

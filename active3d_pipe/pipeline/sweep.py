@@ -175,8 +175,7 @@ class Sweep:
 
     def is_outdated(self, cell: Cell) -> bool:
         """Whether the run in its folder was asked for with other settings: no result of this sweep."""
-        ended = self.ended.get(self._name(cell))
-        return ended is not None and ended.key != cell.key
+        return self._name(cell) in self.ended and self.state(cell) is None
 
     def run(
         self, execute: Callable[[Cell, Path], str], say: Callable[[str], None], is_complete: Callable[[Path], bool],

@@ -208,13 +208,12 @@ def begin_free_space(
         solid = (volume["hit_evidence"] > 0) & ~free
         checked = _open_escape(passable, clear, solid, grid, position, (required, escape), settings)
     passable[tuple(start)] = True
-    planar = motion.model == "ground"
-    moves = kernels.open_moves(passable.view(np.uint8), planar)
+    moves = kernels.open_moves(passable.view(np.uint8), motion.planar)
     pool = ThreadPoolExecutor(1)
     found = pool.submit(_geodesic, risk, moves, start, settings, UNREACHABLE)
     pool.shutdown(wait=False)
     return lambda: FreeSpace(
-        risk, free, checked, passable, moves, start, required, escape, *found.result(), planar
+        risk, free, checked, passable, moves, start, required, escape, *found.result(), motion.planar
     )
 
 

@@ -49,7 +49,7 @@ def read_mesh(path: Path) -> TriangleMesh:
 
 def _header(path: Path) -> bytes:
     with open(path, "rb") as f:
-        return f.read(1024).partition(b"end_header")[0].replace(b"\r", b"")
+        return f.read(1024).partition(b"end_header")[0]
 
 
 def _to_trimesh(mesh: TriangleMesh) -> "trimesh.Trimesh":

@@ -16,3 +16,8 @@ class MotionSettings(Settings):
     model: Literal["free", "ground"] = Field(
         "free", description="free: camera with six degrees of freedom; ground: robot at the height of the start pose"
     )
+
+    @property
+    def planar(self) -> bool:
+        """Whether the agent stays at one height."""
+        return self.model == "ground"

@@ -1,5 +1,7 @@
 """The whole volume: the paper's qualitative cases on the box room, determinism, refusals."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from uncertainty_room import (
@@ -19,7 +21,7 @@ from active3d_pipe.geometry import projection
 from active3d_pipe.structures import VOLUMES, GaussianModel, VoxelGrid
 from active3d_pipe.uncertainty import volume as volume_module
 from active3d_pipe.uncertainty.config import UncertaintySettings
-from active3d_pipe.uncertainty.terms import MASKED
+from active3d_pipe.uncertainty.terms import MASKED, open_to_the_field
 from active3d_pipe.uncertainty.volume import compute_volume, make_grid
 
 GRID = room_grid()
@@ -36,12 +38,14 @@ def surface_points(fs):
     return np.concatenate([p[::4, ::4].reshape(-1, 3) for p in points] or [np.zeros((0, 3))])
 
 
-def volume(fs, previous=None, *, query=field, views=None, predicted=(), gaussians=None, settings=S, grid=GRID):
+def volume(
+    fs, previous=None, *, query=field, views=None, predicted=(), gaussians=None, settings=S, grid=GRID, last=None
+):
     return compute_volume(
         grid=grid, round=0 if previous is None else previous.round + 1, previous=previous, field_query=query,
         gaussians=gaussians if gaussians is not None else gaussians_on(surface_points(fs)), new_frames=fs,
         views=[residual(f, 0.005, 0.02) for f in fs] if views is None else views, predicted=predicted,
-        settings=settings,
+        settings=settings, last_field_query=last,
     )
 
 
@@ -49,6 +53,17 @@ def volume(fs, previous=None, *, query=field, views=None, predicted=(), gaussian
 def seen():
     """Three looks in one direction: half of the room stays unseen."""
     return volume(frames(LOOKS))
+
+
+def test_what_is_seen_for_the_first_time_is_compared_with_the_last_rounds_field(seen):
+    # Where the field was not asked the volume holds an SDF of long ago; the field itself has not changed since.
+    known = open_to_the_field(volume_module._evidence_of(seen), S)
+    stale = replace(seen, arrays={**seen.arrays, "sdf": np.where(known, seen["sdf"], np.float32(-0.1))})
+    looks = frames((120, 150, 180), first_step=3)
+    asked, unasked = (volume(looks, stale, last=query) for query in (field, None))
+    revealed = (asked["hit_evidence"] > 0) & ~known
+    assert revealed.sum() > 100 and unasked["u_time"][revealed].mean() > 0.1
+    assert (asked["u_time"][revealed] == 0).all()
 
 
 def known_free(v):
