@@ -42,7 +42,7 @@ from active3d_pipe.uncertainty.volume import make_grid
 
 NEAR_M = 0.05
 MODULES = {  # functions of planning.decide -> name in the table of times
-    "build_reward_field": "information", "build_free_space": "risk field", "score": "candidates and reward",
+    "build_reward_field": "information", "begin_free_space": "risk field", "score": "candidates and reward",
     "reward_density": "path", "plan_path": "path", "looks_along": "looks along the path",
 }  # fmt: skip
 
@@ -206,13 +206,13 @@ def main() -> None:
     print("| " + " | ".join(head) + " |\n|" + "---|" * len(head))
     times = []
     for file in given.scenes:
-        sim = make_simulator(SceneSettings(file=str(file)), CameraSettings(width=150, height=85), SensorSettings(), 0)
+        sim = make_simulator(SceneSettings(file=str(file)), CameraSettings(width=300, height=170), SensorSettings(), 0)
         points = sample_surface(sim.scene.surface, given.points, np.random.default_rng(1)).astype(np.float64)
         points = points[observable_points(sim, points, np.random.default_rng(0))]
         name = file.resolve().parent.name
         for policy in given.policies:
             seconds.clear()
-            world = CarvedWorld(sim, points, UncertaintySettings(ray_stride=1))
+            world = CarvedWorld(sim, points, UncertaintySettings())
             r = explore(world, policy, given.steps, motion, settings, given.seed, seconds)
             rank, ratio = gain_correlation(r["log"])
             print(

@@ -63,8 +63,7 @@ def replay(run: Path, given: argparse.Namespace) -> list[dict]:
     # The run says what was mapped; the uncertainty judged is that of the present defaults, plus --set.
     present = load_config(None, given.settings).uncertainty
     config = load_run_config(run / "run.toml", Config).model_copy(update={"uncertainty": present})
-    changed = {name: max(1, getattr(present, name) // given.scale) for name in ("ray_stride", "render_stride")}
-    config = with_values(config, uncertainty=changed)
+    config = with_values(config, uncertainty={"render_stride": max(1, present.render_stride // given.scale)})
     settings = config.uncertainty
     folders = sorted(p for p in (run / "capture").iterdir() if (p / shared.LOG_NAME).exists())[: given.rounds]
     rounds = [[smaller(f, given.scale) for f in shared.load_frames(p)] for p in folders]

@@ -12,8 +12,8 @@ from active3d_pipe.planning.free_space import FreeSpace
 from active3d_pipe.planning.kernels_candidates import best_of_blocks
 from active3d_pipe.structures.camera import Camera
 
-# Rays of the sphere: rows of elevation and twice as many columns of azimuth, 7.5 degrees apart; closer together where
-# the image would hold fewer than four rows of them, but never more rows than the most.
+# Rays of the sphere: rows of elevation 7.5 degrees apart, and as far apart within each row; closer together where the
+# image would hold fewer than four rows of them, but never more rows than the most.
 NUM_ELEVATIONS, ROWS_A_VIEW, MOST_ELEVATIONS = 24, 4, 192
 
 
@@ -23,7 +23,7 @@ class Directions:
 
     Attributes:
         rays: (M, 3) float32 unit directions, world. solid_angles: (M,) float32, sr.
-        rotations: (V, 3, 3) R_world_camera of the views. yaws, pitches: (V,) rad.
+        rotations: (V, 3, 3) R_world_camera of the views.
         members: (V, M) float32, 1 where a ray lies in the image of a view.
         angles: (V, V) rad, rotation between two views.
     """
@@ -31,8 +31,6 @@ class Directions:
     rays: np.ndarray
     solid_angles: np.ndarray
     rotations: np.ndarray
-    yaws: np.ndarray
-    pitches: np.ndarray
     members: np.ndarray
     angles: np.ndarray
 
@@ -48,13 +46,7 @@ def view_directions(
     narrow = 2 * math.atan(min(camera.width / camera.fx, camera.height / camera.fy) / 2)
     least = min(math.ceil(ROWS_A_VIEW * math.pi / narrow), MOST_ELEVATIONS)
     num_elevations = max(num_elevations, math.ceil(num_elevations / NUM_ELEVATIONS * least))
-    num_azimuths = 2 * num_elevations
-    azimuth = (np.arange(num_azimuths) + 0.5) * (2 * math.pi / num_azimuths) - math.pi
-    edges = np.linspace(-math.pi / 2, math.pi / 2, num_elevations + 1)
-    elevation = 0.5 * (edges[1:] + edges[:-1])
-    band = (np.sin(edges[1:]) - np.sin(edges[:-1])) * (2 * math.pi / num_azimuths)
-    el, az = (a.ravel() for a in np.meshgrid(elevation, azimuth, indexing="ij"))
-    rays = np.stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)], axis=-1)
+    rays, solid_angles = _sphere(num_elevations)
     yaw_steps = np.arange(num_yaws) * (2 * math.pi / num_yaws) - math.pi
     yaws, pitches = (a.ravel() for a in np.meshgrid(yaw_steps, np.radians(pitches_deg), indexing="ij"))
     rotations = np.stack([
@@ -67,9 +59,19 @@ def view_directions(
     u, v = camera.fx * local[..., 0] / z + camera.cx, camera.fy * local[..., 1] / z + camera.cy
     members = (local[..., 2] > 1e-6) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
     return Directions(
-        rays.astype(np.float32), np.repeat(band, num_azimuths).astype(np.float32), rotations, yaws, pitches,
-        members.astype(np.float32), angles,
+        rays.astype(np.float32), solid_angles.astype(np.float32), rotations, members.astype(np.float32), angles,
     )
+
+
+def _sphere(num_elevations: int) -> tuple[np.ndarray, np.ndarray]:
+    """Unit directions (M, 3) that are spread evenly over a sphere in rows of elevation, and their solid angles (M,)."""
+    edges = np.linspace(-math.pi / 2, math.pi / 2, num_elevations + 1)
+    elevation = 0.5 * (edges[1:] + edges[:-1])
+    counts = np.ceil(2 * num_elevations * np.cos(elevation)).astype(np.int64)
+    azimuth = np.concatenate([(np.arange(n) + 0.5) * (2 * math.pi / n) - math.pi for n in counts])
+    el = np.repeat(elevation, counts)
+    rays = np.stack([np.cos(el) * np.cos(azimuth), np.cos(el) * np.sin(azimuth), np.sin(el)], axis=-1)
+    return rays, np.repeat(2 * math.pi * np.diff(np.sin(edges)) / counts, counts)
 
 
 def coarse_positions(space: FreeSpace, settings: PlanningSettings) -> np.ndarray:

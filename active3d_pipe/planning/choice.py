@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from active3d_pipe.geometry.voxel_traversal import fan_stride
 from active3d_pipe.information.gain import GainTerms
 from active3d_pipe.planning.candidates import Directions, coarse_positions, fine_positions, view_directions
 from active3d_pipe.planning.config import PlanningSettings
@@ -17,6 +18,8 @@ from active3d_pipe.structures.camera import Camera
 from active3d_pipe.structures.decision import Decision, ScoredCandidate
 from active3d_pipe.structures.motion import MotionSettings
 
+# Of the short list a fan of rays that is so many times coarser says which may lead; only those get the dense one.
+GLANCE = 2
 # Where hidden space was searched: how many positions for each exactly scored view are estimated a second time, and the
 # rows of rays they are estimated with.
 SECOND_LOOKS, FINE_ELEVATIONS = 4, 48
@@ -24,12 +27,12 @@ SECOND_LOOKS, FINE_ELEVATIONS = 4, 48
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pool:
-    """The candidates that were scored exactly, best first.
+    """The candidates on the short list, best first.
 
     Attributes:
         poses: (C, 4, 4). voxels: (C, 3) int64 voxel of each position.
-        terms: exact gain of each. travel_m: (C,) geodesic cost. utility: (C,).
-        committed: (C,) bool, the goal of the decision before.
+        terms: gain of each, exact of those that lead by utility or by reward.
+        travel_m: (C,) geodesic cost. utility: (C,). committed: (C,) bool, the goal of the decision before.
         num_candidates: how many views were scored at all.
         positions: (P, 3) int64, all positions scored. best_rewards: (P,) float32 reward of the best view of each.
     """
@@ -142,11 +145,21 @@ def score(  # noqa: PLR0913  (what a decision knows, by name)
         poses = np.concatenate([poses, old[0][None]])
         goal_voxels = np.concatenate([goal_voxels, old[1][None]])
         committed = np.append(committed, True)
-    terms = exact_terms(field, poses, camera)
     travel = space.cost[tuple(goal_voxels.T)].astype(np.float64)
-    reward = np.array([t.reward for t in terms])
-    final = utility_rate(reward, view_cost_steps(travel, R, poses[:, :3, :3], motion), settings)
-    final = np.where(committed, final * settings.commitment, final)
+    steps = view_cost_steps(travel, R, poses[:, :3, :3], motion)
+
+    def ranked(terms: list[GainTerms]) -> np.ndarray:
+        final = utility_rate(np.array([t.reward for t in terms]), steps, settings)
+        return np.where(committed, final * settings.commitment, final)
+
+    glance = GLANCE * fan_stride(camera, space.grid.voxel_size, field.max_range_m)
+    terms = exact_terms(field, poses, camera, glance)
+    by_reward = np.array([t.reward for t in terms])
+    leaders = [np.argsort(-ranking, kind="stable")[: settings.exact_top // 4] for ranking in (ranked(terms), by_reward)]
+    again = np.union1d(np.concatenate(leaders), np.flatnonzero(committed))
+    for i, exact in zip(again.tolist(), exact_terms(field, poses[again], camera), strict=True):
+        terms[i] = exact
+    final = ranked(terms)
     order = np.argsort(-final, kind="stable")
     return Pool(
         poses[order], goal_voxels[order], [terms[i] for i in order], travel[order], final[order], committed[order],

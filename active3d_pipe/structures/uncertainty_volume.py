@@ -18,6 +18,7 @@ VOLUMES: dict[str, tuple[str, str]] = {
     "entropy_exp": ("bit", "Shannon entropy of the observed / Gaussian occupancy"),
     "entropy": ("bit", "H_hybrid (eq. hybrid_entropy)"),
     "sdf": ("m", "signed distance predicted by the field, positive in free space"),
+    "sigma": ("m", "standard deviation of that distance, 0 where the field is not asked"),
     "free_evidence": ("1", "number of depth rays that passed through the voxel"),
     "hit_evidence": ("1", "number of depth rays that ended in the voxel"),
     "view_quality": ("1", "best observation of the voxel's surface so far, 0 = unseen, 1 = close and frontal"),
@@ -26,7 +27,7 @@ VOLUMES: dict[str, tuple[str, str]] = {
     "cells_hit": ("1", "bits of the eight half-size cells of the voxel that depth rays ended in, 0 to 255"),
 }
 # Layers that a producer may leave out: nothing happened there, or nothing is known about parts of voxels.
-ZERO_BY_DEFAULT = ("vain_looks", "cells_passed", "cells_hit")
+ZERO_BY_DEFAULT = ("sigma", "vain_looks", "cells_passed", "cells_hit")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,9 +5,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from active3d_pipe.geometry.voxel_traversal import fan_stride
 from active3d_pipe.structures import Camera, Frame, VoxelGrid
 from active3d_pipe.uncertainty import kernels_carving as kernels
 from active3d_pipe.uncertainty.config import UncertaintySettings
+
+# Distance at which neighbouring rays lie a voxel apart where the stride is not given, m.
+RAY_RANGE_M = 5.0
+# Rows and columns of rays that an image of a narrow camera has at least.
+LEAST_ROWS = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,7 +49,7 @@ class RayEvidence:
 
 
 def integrate_depth(grid: VoxelGrid, frames: Sequence[Frame], settings: UncertaintySettings) -> RayEvidence:
-    """Evidence of `frames` alone, by traversal of the grid along every `ray_stride`-th pixel's ray.
+    """Evidence of `frames` alone, by traversal of the grid along the rays of a lattice of pixels (`ray_stride`).
 
     A ray counts at most once per voxel. A voxel in which some ray of a frame ends is not counted free by other rays
     of the same frame (they graze it). Depth 0 or below `near` says nothing; depth beyond `far` carves up to `far`
@@ -58,8 +64,8 @@ def integrate_depth(grid: VoxelGrid, frames: Sequence[Frame], settings: Uncertai
     passed, ended = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
     for group in by_image_size(frames):
         kernels.carve_frames(
-            *_stacked(group, settings), grid.origin, 1 / grid.voxel_size, settings.reference_footprint_m, free, hit,
-            quality, passed, ended,
+            *_stacked(group, _stride(grid, group, settings)), grid.origin, 1 / grid.voxel_size,
+            settings.reference_footprint_m, free, hit, quality, passed, ended,
         )
     return RayEvidence(
         free.sum(0).astype(np.float32), hit.sum(0).astype(np.float32), quality.max(0),
@@ -76,16 +82,25 @@ def looks_in_vain(
     `vain_range_m` and up to the first voxel of `solid` (bool); sensor dropout beside readings does not count, since
     its neighbours cross the same voxels.
     """
-    s = settings.ray_stride
     vain = np.zeros((kernels.CHUNKS, *grid.shape), np.uint8)
     blocked = np.ascontiguousarray(solid, np.uint8)
-    starts = [_start(f, s) for f in frames]
-    lossy = [f for f, (i, j) in zip(frames, starts, strict=True) if not (f.depth[i::s, j::s] >= f.camera.near).all()]
-    for group in by_image_size(lossy):
-        kernels.mark_vain(
-            *_stacked(group, settings), grid.origin, 1 / grid.voxel_size, settings.vain_range_m, blocked, vain
-        )
+    for group in by_image_size(frames):
+        s = _stride(grid, group, settings)
+        starts = [_start(f, s) for f in group]
+        lossy = [f for f, (i, j) in zip(group, starts, strict=True) if not (f.depth[i::s, j::s] >= f.camera.near).all()]
+        if lossy:
+            kernels.mark_vain(
+                *_stacked(lossy, s), grid.origin, 1 / grid.voxel_size, settings.vain_range_m, blocked, vain
+            )
     return np.bitwise_or.reduce(vain).astype(np.float32)
+
+
+def _stride(grid: VoxelGrid, frames: Sequence[Frame], settings: UncertaintySettings) -> int:
+    """Pixels between two rays of frames of one image size."""
+    if settings.ray_stride:
+        return settings.ray_stride
+    smallest = min(frames[0].depth.shape)
+    return max(1, min(*(fan_stride(f.camera, grid.voxel_size, RAY_RANGE_M) for f in frames), smallest // LEAST_ROWS))
 
 
 def _start(frame: Frame, stride: int) -> tuple[int, int]:
@@ -94,14 +109,14 @@ def _start(frame: Frame, stride: int) -> tuple[int, int]:
 
 
 def _stacked(
-    frames: Sequence[Frame], settings: UncertaintySettings
+    frames: Sequence[Frame], stride: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]:
     """Frames of one image size as the kernels take them: depths, cameras, poses, reaches, first pixels, stride."""
     return (
         np.stack([f.depth for f in frames]), intrinsics([f.camera for f in frames]),
         np.stack([f.T_world_camera for f in frames])[:, :3].astype(np.float64),
         np.array([(f.camera.near, f.camera.far) for f in frames], np.float64),
-        np.array([_start(f, settings.ray_stride) for f in frames], np.int64), settings.ray_stride,
+        np.array([_start(f, stride) for f in frames], np.int64), stride,
     )
 
 

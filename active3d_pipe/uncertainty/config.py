@@ -18,7 +18,10 @@ class UncertaintySettings(Settings):
     )
 
     # Free and hit evidence from depth rays
-    ray_stride: int = Field(4, ge=1, description="every n-th pixel in x and y casts a ray into the grid")
+    ray_stride: int = Field(
+        0, ge=0, description="every n-th pixel in x and y casts a ray into the grid; 0 = so many that rays lie a voxel "
+        "apart 5 m away, whatever the resolution"
+    )
     free_log_odds: float = Field(0.5, gt=0, description="log-odds taken from a voxel by a ray that passed it")
     hit_log_odds: float = Field(2.5, gt=0, description="log-odds given to a voxel by a ray that ended in it")
     free_log_odds_max: float = Field(7.0, gt=0, description="most that passing rays together may take, log-odds")
@@ -39,6 +42,10 @@ class UncertaintySettings(Settings):
     )
 
     # Implicit term
+    field_turns: int = Field(
+        3, ge=1, description="rounds in which the field is asked once about all that matters; near the newest rays it "
+        "is asked in every round"
+    )
     sigma_scale_m: float = Field(0.5, gt=0, description="field sigma at which u_imp reaches 63 percent, m")
     surface_rays: float = Field(
         5.0, gt=0, description="number of rays that end in a voxel after which its surface is known to 63 percent"

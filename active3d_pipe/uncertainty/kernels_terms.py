@@ -207,3 +207,25 @@ def near_open_space(free, hit, c, least_log_odds, out):
                         row[k] |= along[a, b, k]
             for k in range(nz):
                 out[i, j, k] = row[k] == 3
+
+
+@njit(parallel=True, cache=True)
+def due(asked, late, fresh_free, fresh_hit, turn, turns, out):
+    """out (X, Y, Z) u8 = 1 where a voxel of `asked` is `late`, near a ray of this round, or in a block in its turn.
+
+    Blocks of 8 x 8 x 8 voxels, so that the SDF's differences between neighbours are mostly of one round.
+    """
+    nx, ny, nz = asked.shape
+    for i in prange(nx):
+        for j in range(ny):
+            for k in range(nz):
+                if not asked[i, j, k]:
+                    continue
+                if late[i, j, k] or ((i >> 3) + (j >> 3) + (k >> 3) + turn) % turns == 0:
+                    out[i, j, k] = 1
+                    continue
+                for a in range(max(i - 1, 0), min(i + 2, nx)):
+                    for b in range(max(j - 1, 0), min(j + 2, ny)):
+                        for c in range(max(k - 1, 0), min(k + 2, nz)):
+                            if fresh_free[a, b, c] + fresh_hit[a, b, c] > 0:
+                                out[i, j, k] = 1

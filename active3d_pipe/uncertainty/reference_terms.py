@@ -1,7 +1,7 @@
 """Slow twin of `kernels_terms.py`: the same from the formulas over whole volumes; what the tests compare it against."""
 
 import numpy as np
-from scipy.ndimage import minimum_filter
+from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.special import expit
 
 from active3d_pipe.information.entropy import bernoulli_entropy
@@ -51,3 +51,12 @@ def open_to_the_field(evidence: RayEvidence, settings: UncertaintySettings) -> n
     surely_free = (occupancy.attention(evidence, settings) < MASKED).view(np.uint8)
     settled = [minimum_filter(a, size=3, mode="nearest") for a in (unseen, surely_free)]
     return (settled[0] | settled[1]) == 0
+
+
+def due_to_the_field(
+    asked: np.ndarray, late: np.ndarray, fresh: RayEvidence, round: int, settings: UncertaintySettings
+) -> np.ndarray:
+    """See `terms.due_to_the_field`."""
+    near = maximum_filter(fresh.free + fresh.hit > 0, size=3, mode="nearest")
+    turn = (sum(axis // 8 for axis in np.indices(asked.shape)) + round) % settings.field_turns == 0
+    return asked & (late | near | turn)

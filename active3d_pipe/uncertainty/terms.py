@@ -68,5 +68,18 @@ def open_to_the_field(evidence: RayEvidence, settings: UncertaintySettings) -> n
     return out.view(bool)
 
 
+def due_to_the_field(
+    asked: np.ndarray, late: np.ndarray, fresh: RayEvidence, round: int, settings: UncertaintySettings
+) -> np.ndarray:
+    """(X, Y, Z) bool, voxels of `asked` of which the field is asked in this round.
+
+    All that rays of this round came near to, all of `late`, which were not asked about before, and by turns a part of
+    the rest, where the field hardly changes from round to round.
+    """
+    out = np.zeros(asked.shape, np.uint8)
+    kernels_terms.due(asked, late, fresh.free, fresh.hit, round, settings.field_turns, out)
+    return out.view(bool)
+
+
 def _constants(settings: UncertaintySettings) -> TermConstants:
     return TermConstants(*(float(getattr(settings, name)) for name in TermConstants._fields))

@@ -13,7 +13,7 @@ from active3d_pipe.uncertainty import explicit, fusion, occupancy
 from active3d_pipe.uncertainty.carving import RayEvidence, integrate_depth, looks_in_vain
 from active3d_pipe.uncertainty.config import UncertaintySettings
 from active3d_pipe.uncertainty.explicit import ViewResidual
-from active3d_pipe.uncertainty.terms import open_to_the_field, voxel_terms
+from active3d_pipe.uncertainty.terms import due_to_the_field, open_to_the_field, voxel_terms
 
 FieldQuery = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -47,7 +47,7 @@ def compute_volume(  # noqa: PLR0913  (the inputs of the stage, by name)
         grid: of every volume; `previous` must be on the same one.
         previous: volume of the last round, None in the first: it carries the evidence and the fusion statistics.
         field_query: world points (N, 3) float32, m -> (sdf, sigma), (N,) each, m. Asked where it matters
-            (`open_to_the_field`); elsewhere the SDF stays what it was.
+            (`open_to_the_field`) and may have changed (`due_to_the_field`); elsewhere the SDF stays what it was.
         gaussians: the explicit branch of this round's map.
         new_frames: frames captured since `previous`.
         views: renderings of keyframes with this round's map against their images.
@@ -64,12 +64,15 @@ def compute_volume(  # noqa: PLR0913  (the inputs of the stage, by name)
     fresh = integrate_depth(grid, new_frames, settings)
     evidence = before.joined(fresh)
 
-    asked = open_to_the_field(evidence, settings)
-    if previous is not None and last_field_query is not None:
+    asked = due = open_to_the_field(evidence, settings)
+    if previous is not None:
         late = asked & ~open_to_the_field(before, settings)
-        sdf = _query(grid, last_field_query, previous, late)[0]
-        previous = replace(previous, arrays={**previous.arrays, "sdf": sdf})
-    geometry = _query(grid, field_query, previous, asked)
+        due = due_to_the_field(asked, late, fresh, round, settings)
+        if last_field_query is not None:
+            sdf = _query(grid, last_field_query, previous, late)[0]
+            previous = replace(previous, arrays={**previous.arrays, "sdf": sdf})
+    sdf, sigma = _query(grid, field_query, previous, due)
+    geometry = sdf, sigma * asked
     vain = looks_in_vain(grid, new_frames, evidence.hit > 0, settings)
     if previous is not None:
         vain = vain + previous["vain_looks"]
@@ -98,6 +101,7 @@ def compute_volume(  # noqa: PLR0913  (the inputs of the stage, by name)
         "entropy": np.float32(settings.lambda_imp) * terms.entropy_imp
         + np.float32(settings.lambda_exp) * terms.entropy_exp,
         "sdf": geometry[0],
+        "sigma": geometry[1],
         "free_evidence": evidence.free,
         "hit_evidence": evidence.hit,
         "view_quality": evidence.quality,
@@ -130,7 +134,7 @@ def revealed_rows(
 def _query(
     grid: VoxelGrid, field_query: FieldQuery, previous: UncertaintyVolume | None, mask: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """SDF and sigma at the centres of the voxels in `mask`, m, elsewhere the SDF of `previous`; without one, of all."""
+    """SDF and sigma at the centres of the voxels in `mask`, m, elsewhere those of `previous`; without one, of all."""
     if previous is None:
         mask = np.ones(grid.shape, bool)
     points = np.stack([grid.axis(i).astype(np.float32)[at] for i, at in enumerate(np.nonzero(mask))], axis=-1)
@@ -143,8 +147,9 @@ def _query(
         if not np.isfinite(a).all():
             raise NumericalError(f"uncertainty: {name} of the field holds NaN or infinite values")
         out.append(a)
-    sdf = np.zeros(grid.shape, np.float32) if previous is None else previous["sdf"].copy()
-    sigma = np.zeros(grid.shape, np.float32)
+    if previous is None:
+        return out[0].reshape(grid.shape), out[1].reshape(grid.shape)
+    sdf, sigma = previous["sdf"].copy(), previous["sigma"].copy()
     sdf[mask], sigma[mask] = out
     return sdf, sigma
 

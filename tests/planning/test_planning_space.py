@@ -295,3 +295,11 @@ def test_views_hold_the_rays_in_their_frustum():
     assert d.members[3][along.argmax()] == 1
     assert d.members[3][along < 0].sum() == 0
     assert d.angles[0, 1] == pytest.approx(np.radians(15), abs=1e-5)
+
+
+def test_the_rays_of_the_sphere_are_as_far_apart_at_its_poles_as_elsewhere():
+    d = view_directions(Camera.from_fov(600, 340, 90), 4, (0.0,))
+    cos = np.sort(d.rays.astype(np.float64) @ d.rays.T.astype(np.float64), axis=1)[:, -2]
+    apart = np.degrees(np.arccos(cos))
+    assert apart.min() > 5 and apart.max() < 8
+    assert d.solid_angles.max() < 1.5 * d.solid_angles.min()

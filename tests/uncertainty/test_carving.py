@@ -122,6 +122,19 @@ def test_agrees_with_the_traversal_of_the_planner():
     assert np.abs(got.free - free)[elsewhere].sum() <= 0.002 * free.sum()
 
 
+def test_the_rays_that_are_cast_do_not_depend_on_the_resolution():
+    """A voxel of 0.1 m, an image of 90 degrees: 1 / 0.02 = 50 rays from its middle to its edge, and no fewer."""
+    counts = []
+    for width in (100, 200, 600):
+        camera = Camera.from_fov(width, width * 3 // 4, 90, far=10)
+        got = integrate_depth(room_grid(), [frame(0, pose(17.0), camera)], UncertaintySettings())
+        counts.append((got.hit.sum(), got.free.sum()))
+    np.testing.assert_allclose(counts, np.tile(counts[0], (3, 1)), rtol=0.02)
+    assert counts[0][0] == pytest.approx(100 * 75, rel=0.02)
+    narrow = Camera.from_fov(64, 48, 2)
+    assert integrate_depth(room_grid(), [frame(0, pose(17.0), narrow)], UncertaintySettings()).hit.sum() >= 8 * 8
+
+
 def test_a_hit_voxel_is_not_free_in_the_same_frame():
     got = integrate_depth(room_grid(), frames((10,)), EVERY_PIXEL)
     assert got.free[got.hit > 0].max() == 0

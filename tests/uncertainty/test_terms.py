@@ -64,6 +64,22 @@ def test_the_field_is_asked_where_the_formula_says(shape):
     assert got.any()
 
 
+@pytest.mark.parametrize("shape", [(25, 19, 14), (1, 8, 6), (40, 3, 9)])
+def test_the_field_is_asked_again_where_the_formula_says_and_everywhere_within_its_turns(shape):
+    rng = np.random.default_rng(6)
+    asked = rng.random(shape) < 0.7
+    late = asked & (rng.random(shape) < 0.02)
+    free, hit = ((rng.random(shape) < 0.005).astype(np.float32) for _ in range(2))
+    zero, s = np.zeros(shape, np.uint8), UncertaintySettings(field_turns=3)
+    fresh = RayEvidence(free, hit, hit, zero, zero)
+    rounds = [terms.due_to_the_field(asked, late, fresh, k, s) for k in (4, 5, 6)]
+    for k, got in zip((4, 5, 6), rounds, strict=True):
+        np.testing.assert_array_equal(got, reference_terms.due_to_the_field(asked, late, fresh, k, s))
+    np.testing.assert_array_equal(np.logical_or.reduce(rounds), asked)
+    every = terms.due_to_the_field(asked, late, fresh, 4, UncertaintySettings(field_turns=1))
+    np.testing.assert_array_equal(every, asked)
+
+
 def test_the_same_bytes_with_one_thread():
     import numba
 
