@@ -50,7 +50,10 @@ def compare(
     path = out or Path("runs") / name
     sweep = Sweep(path, spec)
     if dry_run:
-        _print_plan(sweep, is_complete)
+        if json:
+            console.out_json(_document(sweep, is_complete))
+        else:
+            _print_plan(sweep, is_complete)
         return
     failed = 0
     if not tables_only:
@@ -58,9 +61,7 @@ def compare(
             failed = sweep.run(partial(_execute, stop), console.say, is_complete, jobs)
     written = write_tables(sweep)
     if json:
-        states = {f"{c.scene}/{c.variant}/seed_{c.seed}": _state(sweep, c, is_complete) for c in sweep.cells}
-        document = {"schema": "active3d.compare/1", "folder": str(path), "runs": states}
-        console.out_json({**document, "files": [str(f) for f in written]})
+        console.out_json({**_document(sweep, is_complete), "files": [str(f) for f in written]})
     else:
         console.out((path / "overall.md").read_text(encoding="utf-8").rstrip())
         console.out("\n" + "\n".join(str(f) for f in written))
@@ -195,6 +196,11 @@ def _state(sweep: "Sweep", cell: "Cell", is_complete: Callable[[Path], bool]) ->
     if ended is not None and ended.state == "failed":
         return f"failed: {ended.error}"
     return "done" if ended is not None and is_complete(cell.folder(sweep.out)) else "to do"
+
+
+def _document(sweep: "Sweep", is_complete: Callable[[Path], bool]) -> dict[str, Any]:
+    states = {f"{c.scene}/{c.variant}/seed_{c.seed}": _state(sweep, c, is_complete) for c in sweep.cells}
+    return {"schema": "active3d.compare/1", "folder": str(sweep.out), "runs": states}
 
 
 def _print_plan(sweep: "Sweep", is_complete: Callable[[Path], bool]) -> None:

@@ -11,6 +11,7 @@ from active3d_pipe.cli import console, session
 if TYPE_CHECKING:
     from active3d_pipe.pipeline.runner import Outcome, Runner
 
+PLAN = "active3d.plan/1"
 _DRY = typer.Option(False, "--dry-run", help="Say what would run and why; do nothing.")
 
 
@@ -27,16 +28,19 @@ def run(
     layers = read_layers(config, set_)
     session.use_threads(layers)
 
-    from active3d_pipe.cli.scene_files import with_scene
+    from active3d_pipe.cli.scene_files import with_files
     from active3d_pipe.pipeline.config import Config, validate, with_values
     from active3d_pipe.pipeline.run_dir import RunDir, new_manifest
     from active3d_pipe.pipeline.runner import Runner
 
-    settings = with_scene(validate(layers, Config), layers.folder)
+    settings = with_files(validate(layers, Config), layers)
     settings = with_values(settings, run={"name": settings.run.name or layers.name})
     path = out or Path("runs") / settings.run.name
     if dry_run and not (path / "manifest.json").is_file():
-        console.out(f"{path}: does not exist yet; everything would run")
+        if json:
+            console.out_json({"schema": PLAN, "last_round": -1, "ended": None, "nodes": []})
+        else:
+            console.out(f"{path}: does not exist yet; everything would run")
         return
     run_dir = RunDir.prepare(path)
     session.run_folder = path
@@ -88,9 +92,12 @@ def export(
     json: bool = session.JSON,
 ) -> None:
     """Copy the final mesh and Gaussians out of a run, made first if need be."""
+    from active3d_pipe.errors import OutputError
     from active3d_pipe.pipeline import files
     from active3d_pipe.pipeline.stage import NodeId
 
+    if to.resolve().is_relative_to(run.resolve()):
+        raise OutputError(f"--to {to}: lies inside the run, which holds what its stages make; choose another folder")
     runner = session.open_run(run)
     _closing(runner, lambda: runner.run_stage("export"))
     node = NodeId("export")
@@ -162,7 +169,7 @@ def _print_plan(outcome: "Outcome", json: bool, whole: bool = False) -> None:
     if json:
         console.out_json(
             {
-                "schema": "active3d.plan/1", "last_round": outcome.last_round, "ended": outcome.ended,
+                "schema": PLAN, "last_round": outcome.last_round, "ended": outcome.ended,
                 "nodes": [
                     {
                         "node": str(s.node), "state": s.state.value, "hit": s.state.is_hit, "reasons": list(s.reasons)

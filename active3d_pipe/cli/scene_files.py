@@ -8,18 +8,26 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from active3d_pipe.cli.console import say
-from active3d_pipe.errors import ConfigError, InputError
+from active3d_pipe.errors import ConfigError, InputError, OutputError
+from active3d_pipe.pipeline import files
+from active3d_pipe.pipeline.lock import one_at_a_time
 
 if TYPE_CHECKING:
     from active3d_pipe.pipeline.config import Config
+    from active3d_pipe.pipeline.layers import Layers
 
 GENERATED = "generated:"
 SCENES = "ACTIVE3D_SCENES"
+_SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
 _MESHES = ("scene.glb", "scene.gltf", "scene.obj", "scene.ply", "mesh.ply")
 
 
-def with_scene(config: "Config", folder: Path | None) -> "Config":
-    """The configuration with `scene.file` as an absolute path; ConfigError or InputError when there is none."""
+def with_files(config: "Config", layers: "Layers") -> "Config":
+    """The configuration with `scene.file` and `planning.trajectory` as absolute paths, as `layers` mean them.
+
+    Raises:
+        ConfigError, InputError: no scene is given, or there is none of that name; there is no such trajectory.
+    """
     from active3d_pipe.pipeline.config import with_values
 
     if not config.scene.file:
@@ -27,7 +35,16 @@ def with_scene(config: "Config", folder: Path | None) -> "Config":
             "scene.file is not given; give a file, the name of a scene in "
             f"${SCENES}, or a recipe like {GENERATED}rooms=2,seed=7 (for example --set scene.file=room.glb)"
         )
-    return with_values(config, scene={"file": str(resolve(config.scene.file, folder))})
+    scene = resolve(config.scene.file, layers.folder_of("scene.file"))
+    config = with_values(config, scene={"file": str(scene)})
+    walk = config.planning.trajectory
+    if not walk:
+        return config
+    beside = (layers.folder_of("planning.trajectory") or Path.cwd()) / Path(walk).expanduser()
+    found = beside if beside.exists() else Path(walk).expanduser().resolve()
+    if not found.exists():
+        raise InputError(f"planning.trajectory = {walk!r}: no such file or run folder (looked at {beside}, {found})")
+    return with_values(config, planning={"trajectory": str(found)})
 
 
 def resolve(text: str, folder: Path | None = None) -> Path:
@@ -71,21 +88,30 @@ def generate(recipe: str) -> Path:
     folder = cache_folder() / f"apartment_{name}_{_generator_digest()}"
     file = folder / "scene.glb"
     if not file.is_file():
-        say(f"making the scene {recipe} ...")
-        write_apartment(int(values["rooms"]), int(values["seed"]), file, values["detail"])
+        with files.writing(folder), one_at_a_time(folder):
+            if not file.is_file():  # by another process meanwhile
+                say(f"making the scene {recipe} ...")
+                write_apartment(int(values["rooms"]), int(values["seed"]), file, values["detail"])
     return file
 
 
 def write_apartment(rooms: int, seed: int, file: Path, detail: float = 1.0) -> dict:
-    """Write a generated apartment to `file` (.glb) and its `scene.json` beside it; returns the metadata."""
-    from active3d_pipe.pipeline import files
+    """Write a generated apartment to `file` (.glb) and its `scene.json` beside it; returns the metadata.
+
+    Raises:
+        OutputError: the folder holds the `scene.json` of another scene.
+    """
     from active3d_pipe.sim.apartment import make_apartment
 
+    sidecar = file.with_name("scene.json")
+    others = [p.name for p in file.parent.glob("*.*") if p.suffix in _SUFFIXES and p.name != file.name]
+    if sidecar.exists() and others:
+        raise OutputError(f"{sidecar}: belongs to {others[0]}; write {file.name} to a folder of its own")
     apartment = make_apartment(rooms, seed, detail=detail)
-    metadata = apartment.metadata()
+    metadata = {**apartment.metadata(), "file": file.name}
     with files.writing(file):
         file.parent.mkdir(parents=True, exist_ok=True)
-        files.replace_file(file.parent / "scene.json", (json.dumps(metadata, indent=1) + "\n").encode())
+        files.replace_file(sidecar, (json.dumps(metadata, indent=1) + "\n").encode())
         files.replace_file(file, apartment.to_glb())
     return metadata
 

@@ -66,15 +66,17 @@ def open_run(path: Path, overrides: Sequence[str] = (), watch: "Watcher | None" 
 
 
 def run_config(path: Path, overrides: Sequence[str]) -> "Config":
-    """The configuration of a run folder with `--set` texts on top, another scene found as `run` finds it."""
+    """The configuration of a run folder with `--set` texts on top; files named there are found as `run` finds them."""
     from active3d_pipe.pipeline.config import Config, load_run_config
     from active3d_pipe.pipeline.run_dir import RUN_TOML
 
     config = load_run_config(path / RUN_TOML, Config, overrides)
-    if any(text.partition("=")[0].strip() == "scene.file" for text in overrides):
-        from active3d_pipe.cli.scene_files import with_scene
+    files = ("scene.file", "planning.trajectory")
+    if any(text.partition("=")[0].strip() in files for text in overrides):
+        from active3d_pipe.cli.scene_files import with_files
+        from active3d_pipe.pipeline.layers import Layers
 
-        return with_scene(config, None)
+        return with_files(config, Layers())
     return config
 
 

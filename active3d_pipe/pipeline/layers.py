@@ -24,13 +24,11 @@ class Layers:
     Attributes:
         values: nested tables.
         sources: dotted path of a leaf -> the layer that set it, for messages.
-        folder: folder of the configuration file, against which relative paths resolve; None without one.
         name: name of the preset or file, the default name of a run.
     """
 
     values: dict[str, Any] = field(default_factory=dict)
     sources: dict[str, str] = field(default_factory=dict)
-    folder: Path | None = None
     name: str = "run"
 
     def merge(self, table: Mapping[str, Any], source: str, prefix: str = "") -> None:
@@ -47,6 +45,11 @@ class Layers:
                     node = self._table(".".join(parents[: i + 1]), source) if name not in node else node[name]
                 node[leaf] = value
                 self.sources[path] = source
+
+    def folder_of(self, path: str) -> Path | None:
+        """Folder of the configuration file that sets `path`, for relative paths; None when no file does."""
+        source = Path(self.sources.get(path, ""))
+        return source.resolve().parent if source.is_file() else None
 
     def _table(self, path: str, source: str) -> dict[str, Any]:
         node = self.values
@@ -117,22 +120,21 @@ def read_toml(path: Path) -> dict[str, Any]:
 def _read_base(layers: Layers, base: str, seen: tuple[str, ...]) -> None:
     path = Path(base)
     if path.suffix == ".toml" or path.is_file():
-        table, source, layers_folder = read_toml(path), str(path), path.resolve().parent
+        table, source, folder = read_toml(path), str(path), path.resolve().parent
         if any(Path(name).resolve() == path.resolve() for name in seen if name.endswith(".toml")):
             raise ConfigError(f"{source}: `preset` leads back to itself ({' -> '.join((*seen, source))})")
     else:
-        table, source, layers_folder = _read_preset(base), f"preset {base}", None
+        table, source, folder = _read_preset(base), f"preset {base}", None
     if source in seen:
         raise ConfigError(f"{source}: `preset` leads back to itself ({' -> '.join((*seen, source))})")
     below = table.pop("preset", None)
     if below is not None:
         if not isinstance(below, str):
             raise ConfigError(f"{source}: preset = {below!r}; expected the name of a preset, as in preset = \"demo\"")
-        beside = layers_folder / below if layers_folder is not None and below.endswith(".toml") else None
+        beside = folder / below if folder is not None and below.endswith(".toml") else None
         _read_base(layers, str(beside) if beside is not None and beside.is_file() else below, (*seen, source))
     layers.merge(table, source)
     layers.name = path.stem
-    layers.folder = layers_folder or layers.folder
 
 
 def _read_preset(name: str) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from active3d_pipe.pipeline.keys import digest
 from active3d_pipe.pipeline.layers import read_toml
 
 SWEEP = "sweep.json"
+_KINDS = {str: "text", int: "a whole number"}
 KEYS = ("title", "base", "steps", "seeds", "scenes", "variants", "set", "metrics")
 
 
@@ -114,23 +115,34 @@ def read_spec(path: Path, variant_of: Callable[[str], Mapping[str, Any]]) -> Spe
     for key in ("scenes", "variants"):
         if not isinstance(doc.get(key), list) or not doc[key]:
             raise ConfigError(f"{path}: `{key}` is missing; expected a list")
+    for key, kind in (("scenes", str), ("seeds", int), ("set", str), ("metrics", str)):
+        _check_list(doc.get(key, []), kind, f"{path}: `{key}`")
+    for key, kind in (("title", str), ("base", str), ("steps", int)):
+        if type(doc.get(key, kind())) is not kind:
+            raise ConfigError(f"{path}: `{key}` is {doc[key]!r}; expected {_KINDS[kind]}")
     variants = tuple(make_variant(entry, variant_of, str(path)) for entry in doc["variants"])
-    settings = list(doc.get("set", []))
-    if "steps" in doc:
-        settings.insert(0, f"run.steps={int(doc['steps'])}")
+    steps = (f"run.steps={doc['steps']}",) if "steps" in doc else ()
     return checked(
         Spec(
-            str(doc.get("title", path.stem)), str(doc.get("base", "default")), tuple(str(s) for s in doc["scenes"]),
-            tuple(int(s) for s in doc.get("seeds", [0])), variants, tuple(settings), tuple(doc.get("metrics", ())),
+            doc.get("title", path.stem), doc.get("base", "default"), tuple(doc["scenes"]),
+            tuple(doc.get("seeds", [0])), variants, (*steps, *doc.get("set", ())), tuple(doc.get("metrics", ())),
         )
     )
 
 
+def _check_list(values: Any, kind: type, where: str) -> None:
+    """ConfigError unless `values` is a list of `kind`."""
+    if not isinstance(values, list) or any(type(v) is not kind for v in values):
+        raise ConfigError(f"{where} is {values!r}; expected a list, each of them {_KINDS[kind]}")
+
+
 def make_variant(entry: Any, variant_of: Callable[[str], Mapping[str, Any]], where: str) -> Variant:
     """A variant from a name or a table."""
-    table = {"name": entry} if isinstance(entry, str) else dict(entry)
-    if not isinstance(table.get("name"), str) or set(table) - {"name", "label", "set"}:
+    table = entry if isinstance(entry, Mapping) else {"name": entry}
+    named = isinstance(table.get("name"), str) and isinstance(table.get("label", ""), str)
+    if not named or set(table) - {"name", "label", "set"}:
         raise ConfigError(f"{where}: variant {entry!r}; expected a name, or a table with name, label, set")
+    _check_list(table.get("set", []), str, f"{where}: `set` of variant {table['name']!r}")
     texts = flat_settings(variant_of(table["name"]))
     name = re.sub(r"[^A-Za-z0-9._-]+", "_", Path(table["name"]).stem)
     return Variant(name, str(table.get("label", name)), (*texts, *table.get("set", ())))
@@ -166,7 +178,7 @@ class Sweep:
         self.out = out
         self.spec = spec
         self.cells = cells(spec)
-        self.ended = {name: Ended(**e) for name, e in self._read().get("ended", {}).items()}
+        self.ended = self._read()
 
     def state(self, cell: Cell) -> Ended | None:
         """How the run ended, or None when it did not yet (or was asked for with other settings)."""
@@ -226,11 +238,12 @@ class Sweep:
     def _name(self, cell: Cell) -> str:
         return f"{cell.scene}/{cell.variant}/seed_{cell.seed}"
 
-    def _read(self) -> dict[str, Any]:
+    def _read(self) -> dict[str, Ended]:
         path = self.out / SWEEP
         try:
-            return dict(json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else {}
-        except (OSError, ValueError) as error:
+            document = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {"ended": {}}
+            return {name: Ended(**e) for name, e in document["ended"].items()}
+        except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
             raise ConfigError(f"{path}: cannot be read ({error}); remove it, finished runs are found again") from error
 
     def _write(self) -> None:

@@ -30,13 +30,16 @@ def read_result(
         return Result(scene, variant, seed, "failed", {}, nothing, error)
     if outdated or not is_complete(run):
         return Result(scene, variant, seed, "missing", {}, nothing)
-    metrics = {
-        name: float(value) for name, value in _json(run / METRICS_FILE)["metrics"].items() if _is_number(value)
-    }
+    try:
+        found, curve = _json(run / METRICS_FILE)["metrics"].items(), _curve(run)
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as damage:
+        line = f"{run / 'evaluation'} cannot be read ({damage}); active3d evaluate {run}"
+        return Result(scene, variant, seed, "failed", {}, nothing, line)
+    metrics = {name: float(value) for name, value in found if _is_number(value)}
     seconds = loop_seconds(run)
     if seconds is not None and metrics.get("steps"):
         metrics["seconds_per_step"] = seconds / metrics["steps"]
-    return Result(scene, variant, seed, "done", metrics, _curve(run))
+    return Result(scene, variant, seed, "done", metrics, curve)
 
 
 def loop_seconds(run: Path) -> float | None:

@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -11,53 +10,8 @@ import pytest
 
 from active3d_pipe.cli import console
 from active3d_pipe.cli.main import _main
-from active3d_pipe.errors import ConfigError, InputError
-from tests.pipeline import toy
+from tests.cli.conftest import ROOT, RUN
 from tests.pipeline.conftest import snapshot
-
-ROOT = Path(__file__).resolve().parents[2]
-
-
-@pytest.fixture(autouse=True)
-def toy_stages(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setitem(sys.modules, "stages.registry", toy)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("ACTIVE3D_SCENES", raising=False)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    (tmp_path / "room.glb").touch()
-
-
-@pytest.fixture
-def call(capsys: pytest.CaptureFixture[str]):
-    """Run a command line; returns (exit code, stdout, stderr)."""
-    def call(*arguments: object) -> tuple[int, str, str]:
-        capsys.readouterr()
-        code = _main([str(a) for a in arguments])
-        out, err = capsys.readouterr()
-        assert "Traceback" not in out + err
-        return code, out, err
-
-    return call
-
-
-RUN = (
-    "run", "default", "--set", "scene.file=room.glb", "--set", "run.steps=10", "--set", "camera.height=8", "--out", "r",
-)
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A complete run made by the command line."""
-    folder = tmp_path_factory.mktemp("cli")
-    (folder / "room.glb").touch()
-    drive = ROOT / "tests" / "pipeline" / "drive.py"
-    subprocess.run([sys.executable, str(drive), *RUN], cwd=folder, check=True, capture_output=True)
-    return folder / "r"
-
-
-@pytest.fixture
-def run(made: Path, tmp_path: Path) -> Path:
-    return shutil.copytree(made, tmp_path / "r")
 
 
 def test_run_resume_and_again(call, tmp_path: Path) -> None:
@@ -251,34 +205,6 @@ def test_config_show_and_schema(call) -> None:
     code, out, _ = call("config", "schema")
     assert json.loads(out)["properties"].keys() >= {"run", "scene", "camera", "mapping", "planning"}
     assert "demo" in call("config", "presets")[1].split()
-
-
-def test_scenes_are_found_beside_the_file_by_path_and_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from active3d_pipe.cli.scene_files import resolve
-
-    for folder in ("configs", "scenes/flat", "scenes/replica"):
-        (tmp_path / folder).mkdir(parents=True)
-    for file in ("configs/room.glb", "scenes/flat/scene.glb", "scenes/replica/mesh.ply"):
-        (tmp_path / file).touch()
-    assert resolve("room.glb", tmp_path / "configs") == tmp_path / "configs/room.glb"
-    assert resolve("room.glb") == tmp_path / "room.glb"
-    with pytest.raises(InputError, match=r"scene 'flat': no such file .* names their folder"):
-        resolve("flat")
-    monkeypatch.setenv("ACTIVE3D_SCENES", str(tmp_path / "scenes"))
-    assert resolve("flat") == tmp_path / "scenes/flat/scene.glb"
-    assert resolve("replica") == tmp_path / "scenes/replica/mesh.ply"
-
-
-def test_a_generated_scene_is_made_once(tmp_path: Path) -> None:
-    from active3d_pipe.cli.scene_files import generate
-
-    file = generate("generated:rooms=1,seed=3,detail=0.3")
-    stamp = file.stat().st_mtime_ns
-    assert file.read_bytes()[:4] == b"glTF"
-    assert json.loads((file.parent / "scene.json").read_text())["seed"] == 3
-    assert generate("generated:rooms=1,seed=3,detail=0.3").stat().st_mtime_ns == stamp
-    with pytest.raises(ConfigError, match="cannot read 'room=1'"):
-        generate("generated:room=1")
 
 
 def test_inspect_draws_a_volume(call, run: Path, tmp_path: Path) -> None:

@@ -142,8 +142,18 @@ def test_a_value_may_replace_a_table_and_the_other_way_round() -> None:
     assert layers.source_of("c.d") == "second"
 
 
-def test_the_folder_and_name_of_the_file_are_kept(write) -> None:
+def test_a_relative_path_belongs_to_the_file_that_says_it(tmp_path: Path) -> None:
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "deep/below.toml").write_text('[scene]\nfile = "room.glb"\n[planning]\ntrajectory = "walk"\n')
+    (tmp_path / "top.toml").write_text('preset = "deep/below.toml"\n[planning]\ntrajectory = "other"\n')
+    layers = read_layers(str(tmp_path / "top.toml"), environ={})
+    assert layers.folder_of("scene.file") == tmp_path / "deep"
+    assert layers.folder_of("planning.trajectory") == tmp_path
+    assert read_layers(str(tmp_path / "top.toml"), ["scene.file=x.glb"], {}).folder_of("scene.file") is None
+
+
+def test_the_name_of_the_file_is_kept(write) -> None:
     file = write('preset = "demo"\n', "my_room.toml")
     layers = read_layers(file, environ={})
-    assert (layers.name, layers.folder) == ("my_room", Path(file).parent)
+    assert layers.name == "my_room" and layers.folder_of("scene.file") is None
     validate(layers, Config)

@@ -53,6 +53,16 @@ def test_settings_are_what_the_command_line_takes(spec):
         ('scenes = []', "`scenes` is missing"),
         ('variants = ["a", "a"]', "given twice"),
         ('variants = [{ label = "x" }]', "expected a name"),
+        ('variants = [{ name = "a", label = 3 }]', "expected a name"),
+        ('variants = [1]', "expected a name"),
+        ('variants = [{ name = "a", set = "x.y=1" }]', "`set` of variant 'a' is 'x.y=1'; expected a list"),
+        ('seeds = "0"', "`seeds` is '0'; expected a list"),
+        ('seeds = ["a"]', "each of them a whole number"),
+        ('scenes = [3]', "each of them text"),
+        ('set = "run.threads=1"', "`set` is 'run.threads=1'; expected a list"),
+        ('metrics = "psnr"', "`metrics` is 'psnr'; expected a list"),
+        ('steps = "5"', "`steps` is '5'; expected a whole number"),
+        ('base = 3', "`base` is 3; expected text"),
     ],
 )
 def test_mistakes_are_one_line(tmp_path, change, said):
@@ -63,6 +73,13 @@ def test_mistakes_are_one_line(tmp_path, change, said):
     with pytest.raises(ConfigError, match=said) as error:
         s.read_spec(file, settings_of)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("text", ["[]", "{}", '{"ended": {"a": 3}}', '{"ended": {"a": {"x": 1}}}', "{"])
+def test_a_damaged_account_of_a_sweep_is_one_line(spec, tmp_path, text):
+    (tmp_path / s.SWEEP).write_text(text)
+    with pytest.raises(ConfigError, match=r"cannot be read .*; remove it, finished runs are found again"):
+        s.Sweep(tmp_path, spec)
 
 
 def drive(spec, out, fails=(), stop_at=None, jobs=1):

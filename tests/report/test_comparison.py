@@ -162,6 +162,10 @@ def test_reading_a_run_folder(tmp_path):
     assert r.metrics == {"psnr": 30.0, "steps": 20.0, "seconds_per_step": 8 / 20}
     np.testing.assert_allclose(r.curve, [(10, 0.5, 0.5), (20, 3.5, 0.75)])
     assert read_result("a", "v", 0, run, "broke").state == "failed"
+    for text in ("{", "[]", '{"metrics": 3}'):
+        (run / "evaluation" / "metrics.json").write_text(text)
+        r = read_result("a", "v", 0, run)
+        assert r.state == "failed" and "active3d evaluate" in r.error
 
 
 def test_what_is_neither_good_nor_bad_is_not_marked(results):
