@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Numba kernel that finds places from which given voxels can be seen; its slow twin is in the tests."""
+"""Numba kernels of targets: what is most worth seeing, and places from which it can be; slow twins in the tests."""
 
 import numpy as np
 from numba import njit, prange
@@ -7,6 +7,30 @@ from numba import njit, prange
 from active3d_pipe.planning.kernels_sight import cell_bit
 
 ZERO, QUARTER, HALF, ONE = np.float32(0.0), np.float32(0.25), np.float32(0.5), np.float32(1.0)
+
+
+@njit(cache=True)
+def best_of_each_block(worth, block):
+    """(flat voxel of the most worth, sum of the worth) of each block of block^3 voxels of (X, Y, Z); int64, float64.
+
+    What has no worth does not count; -1 where a block has none. Ties: the first voxel.
+    """
+    nx, ny, nz = worth.shape
+    by, bz = ny // block + 1, nz // block + 1
+    first = np.full((nx // block + 1) * by * bz, -1, np.int64)
+    total, most = np.zeros(first.size), np.zeros(first.size, worth.dtype)
+    for i in range(nx):
+        for j in range(ny):
+            for k in range(nz):
+                w = worth[i, j, k]
+                if not w > 0:
+                    continue
+                b = (i // block * by + j // block) * bz + k // block
+                total[b] += w
+                if w > most[b]:
+                    most[b] = w
+                    first[b] = (i * ny + j) * nz + k
+    return first, total
 
 
 @njit(parallel=True, cache=True)

@@ -75,15 +75,10 @@ def _best_of_each_block(
     worth: np.ndarray, grid: VoxelGrid, settings: PlanningSettings
 ) -> tuple[np.ndarray, np.ndarray]:
     """Flat voxels (B,) of the most worth in each block that has any, ties to the first, and the blocks' sums."""
-    ids = np.flatnonzero(worth > 0)
-    ijk = np.stack(np.unravel_index(ids, grid.shape), axis=-1)
     block = max(1, round(settings.target_block_m / grid.voxel_size))
-    shape = tuple(n // block + 1 for n in grid.shape)
-    key = np.ravel_multi_index(tuple((ijk // block).T), shape)
-    total = np.bincount(key, weights=worth[ids], minlength=int(np.prod(shape)))
-    order = np.lexsort((ids, -worth[ids], key))
-    first = order[np.unique(key[order], return_index=True)[1]]
-    return ids[first], total[key[first]]
+    first, total = kernels_targets.best_of_each_block(worth.reshape(grid.shape), block)
+    found = first >= 0
+    return first[found], total[found]
 
 
 def _targets(field: RewardField, settings: PlanningSettings) -> tuple[np.ndarray, np.ndarray]:

@@ -74,6 +74,22 @@ def test_best_viewpoints_equal_the_reference():
                 assert values[chosen] == pytest.approx(values.max(), rel=1e-4)
 
 
+def test_best_of_each_block_equals_the_reference():
+    rng = np.random.default_rng(2)
+    worth = (rng.integers(-2, 5, (11, 7, 8)) * (rng.random((11, 7, 8)) < 0.3)).astype(np.float32)
+    first, total = kernels_targets.best_of_each_block(worth, 3)
+    blocks = [worth[i:i + 3, j:j + 3, k:k + 3] for i in range(0, 12, 3) for j in range(0, 9, 3) for k in range(0, 9, 3)]
+    corners = [(i, j, k) for i in range(0, 12, 3) for j in range(0, 9, 3) for k in range(0, 9, 3)]
+    assert len(first) == len(blocks)
+    for at, mass, block, corner in zip(first, total, blocks, corners, strict=True):
+        assert mass == np.maximum(block, 0).sum()
+        if block.max(initial=0) <= 0:
+            assert at == -1
+        else:
+            best = np.unravel_index(block.argmax(), block.shape)
+            assert at == np.ravel_multi_index(np.add(corner, best), worth.shape)
+
+
 def looked_around(world, start):
     """Free space, reward field and last pose of an agent that turned on the spot, looking up and down."""
     start = np.array(start)
