@@ -1,6 +1,6 @@
 """What a decision costs, by module: uncertainty volume, free space, reward field, candidates, path.
 
-    python benchmarks/decision.py RUN ... [--rounds 8] [--repeats 3]
+    python benchmarks/decision.py RUN ... [--rounds 8] [--repeats 3] [--set uncertainty.ray_stride=4 ...]
 
 Rounds of finished runs, evenly spread, are decided again from their artifacts (the newest map stands for that of every
 round; nothing is written). Milliseconds, the least of the repeats; a part does not count what its parts count. Run it
@@ -115,9 +115,10 @@ def main() -> None:
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument("--rounds", type=int, default=8, help="rounds of each run, evenly spread")
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--set", action="append", default=[], dest="settings", help="instead of the run's, a.b=value")
     args = parser.parse_args()
     for path in args.runs:
-        run = FinishedRun(path)
+        run = FinishedRun(path, tuple(args.settings))
         rounds = [k for k in spread(range(1, run.last_round + 1), args.rounds) if _grids_agree(run, k)]
         decide_again(run, rounds[0], 1)  # compiles
         found = [decide_again(run, k, args.repeats) for k in rounds]

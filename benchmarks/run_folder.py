@@ -21,13 +21,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """Reads what it is asked for, once."""
+    """Reads what it is asked for, once; `settings` are `a.b=value` texts on top of the run's own."""
 
     path: Path
+    settings: tuple[str, ...] = ()
 
     @cached_property
     def config(self) -> Any:
-        return load_run_config(self.path / "run.toml", Config)
+        return load_run_config(self.path / "run.toml", Config, self.settings)
 
     @cached_property
     def last_round(self) -> int:
