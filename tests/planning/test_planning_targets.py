@@ -8,7 +8,7 @@ from active3d_pipe.planning.choice import score
 from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.free_space import build_free_space
 from active3d_pipe.planning.reference_reward import cell_bit
-from active3d_pipe.planning.reward import build_reward_field
+from active3d_pipe.planning.reward import build_reward_field, exact_terms
 from active3d_pipe.planning.targets import hidden_positions, target_positions
 from active3d_pipe.structures.motion import MotionSettings
 
@@ -100,6 +100,20 @@ def looked_around(world, start):
     field = build_reward_field(volume, poses, world.camera, SETTINGS)
     space = build_free_space(volume, poses[-1], poses[:, :3, 3], MOTION, SETTINGS)
     return space, field, poses[-1]
+
+
+def test_those_that_lead_the_short_list_are_scored_exactly():
+    world = box_world.build((3.0, 2.4, 2.6), [((0.4, 0.35, 0.0), (2.6, 0.6, 1.2))])
+    space, field, T = looked_around(world, (1.5, 1.6, 1.0))
+    pool = score(space, field, T, world.camera, MOTION, SETTINGS, None)
+    exact = [t.reward for t in exact_terms(field, pool.poses, world.camera)]
+    found = [t.reward for t in pool.terms]
+    for lead in (0, int(np.argmax(found))):
+        assert found[lead] == exact[lead] > 0
+    assert list(pool.utility) == sorted(pool.utility, reverse=True)
+    # The others had a glance: about right, and mostly too low.
+    assert found != exact and np.corrcoef(found, exact)[0, 1] > 0.9
+    assert np.sum(found) < np.sum(exact)
 
 
 def test_positions_that_see_what_is_left_are_found():
