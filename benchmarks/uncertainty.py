@@ -4,8 +4,9 @@
 
 The frames of each run are mapped again at reduced resolution, round by round, with the volume computed from it. The
 volume of round k is then judged on the voxels whose surface the frames of the next rounds show: the realised error
-of the map of round k there is the normalised residual (METHOD.md), half colour, a quarter rendered depth, a quarter
-the field's SDF at the observed points, each saturating at its scale. Space where the map has nothing counts as wrong.
+of the map of round k there is the normalised residual (`ViewResidual.normalised`): half colour, a quarter rendered
+depth, a quarter the field's SDF at the observed points, each saturating at its scale. Space where the map has nothing
+counts as wrong.
 Prints a Markdown table: Spearman's rank correlation and AUSE (mean over rounds 1..), for all revealed voxels, and for
 those that rays had ended in before (where seen against unseen is no help). Curves go to OUT as PNG.
 Runs whose judgement is in OUT already are only read. Numbers are comparable among runs of one resolution only.
@@ -34,6 +35,7 @@ from stages import shared
 from stages.uncertainty import examined_frames, residuals
 
 TERMS = ("u_imp", "u_exp", "u_time", "equal weights", "u_final")
+REVEALING_STRIDE = 2  # every n-th pixel's ray reveals voxels, whatever rays the volume is made of
 SETS = ("all revealed", "seen before")
 COLORS = ("tab:blue", "tab:orange", "tab:green", "tab:gray", "tab:red")
 
@@ -51,7 +53,8 @@ def judge(
 ) -> dict[str, tuple[dict[str, np.ndarray], np.ndarray]]:
     """For both sets of voxels: uncertainty by term, and realised error."""
     error, coverage = backproject(volume.grid, ahead, settings)
-    revealed = (integrate_depth(volume.grid, frames, settings).hit > 0) & (coverage > 0)
+    rays = integrate_depth(volume.grid, frames, settings.model_copy(update={"ray_stride": REVEALING_STRIDE}))
+    revealed = (rays.hit > 0) & (coverage > 0)
     values = {name: volume[name] for name in ("u_imp", "u_exp", "u_time", "u_final")}
     values["equal weights"] = (values["u_imp"] + values["u_exp"] + values["u_time"]) / 3
     masks = zip(SETS, (revealed, revealed & (volume["hit_evidence"] > 0)), strict=True)

@@ -48,7 +48,7 @@ class UncertaintySettings(Settings):
     )
     sigma_scale_m: float = Field(0.5, gt=0, description="field sigma at which u_imp reaches 63 percent, m")
     surface_rays: float = Field(
-        5.0, gt=0, description="number of rays that end in a voxel after which its surface is known to 63 percent"
+        2.2, gt=0, description="number of rays that end in a voxel after which its surface is known to 63 percent"
     )
     sigma_floor_m: float = Field(0.01, gt=0, description="least field sigma believed for occupancy, m")
 
