@@ -16,6 +16,7 @@ from active3d_pipe.cli import console, session
 if TYPE_CHECKING:
     from active3d_pipe.pipeline.interrupt import StopRequest
     from active3d_pipe.pipeline.sweep import Cell, Spec, Sweep
+    from active3d_pipe.report.comparison import Metric
 
 FOLDERS = ("ablations", "baselines", "maps")
 
@@ -47,6 +48,7 @@ def compare(
     from active3d_pipe.report.comparison_data import is_complete
 
     spec, name = _spec(what, scene, seed, steps, base, set_)
+    _metrics(spec)  # a wrong name is told before hours of runs
     path = out or Path("runs") / name
     sweep = Sweep(path, spec)
     if dry_run:
@@ -84,6 +86,11 @@ def variant_settings(name: str) -> Mapping[str, Any]:
         table = read_toml(Path(name))
         if "preset" in table:
             raise ConfigError(f"{name}: a variant lies on top of the base and names no preset; use --base, or `base`")
+        planning = table.get("planning")
+        if isinstance(planning, dict) and isinstance(walk := planning.get("trajectory"), str) and walk:
+            # Its settings become those of a command line, where a relative path belongs to the working directory.
+            beside = Path(name).resolve().parent / walk
+            planning["trajectory"] = str(beside) if beside.exists() else walk
         return table
     for folder in FOLDERS:
         entry = package_files("configs").joinpath(folder, f"{name}.toml")
@@ -116,6 +123,17 @@ def _spec(
         settings=(*spec.settings, *more),
     )
     return checked(spec), name
+
+
+def _metrics(spec: "Spec") -> "list[Metric]":
+    """The rows of the tables; ConfigError for a name that is not known."""
+    from active3d_pipe.errors import ConfigError
+    from active3d_pipe.report.comparison_tables import chosen_metrics
+
+    try:
+        return chosen_metrics(spec.metrics)
+    except KeyError as error:
+        raise ConfigError(f"metrics: {error} is not known; expected names of METRICS in report/comparison.py") from None
 
 
 def command(cell: "Cell", folder: Path) -> list[str]:
@@ -153,7 +171,6 @@ def _execute(stop: "StopRequest", cell: "Cell", folder: Path) -> str:
 
 def write_tables(sweep: "Sweep") -> list[Path]:
     """Write every table and figure of what is there; the files."""
-    from active3d_pipe.errors import ConfigError
     from active3d_pipe.pipeline import files
     from active3d_pipe.report import comparison_tables as tables
     from active3d_pipe.report.comparison import EXTRA, paired_tests
@@ -167,10 +184,7 @@ def write_tables(sweep: "Sweep") -> list[Path]:
         outdated = sweep.is_outdated(cell)
         results.append(read_result(cell.scene, cell.variant, cell.seed, cell.folder(sweep.out), error, outdated))
     labels = {v.name: v.label for v in sweep.spec.variants}
-    try:
-        metrics = tables.chosen_metrics(sweep.spec.metrics)
-    except KeyError as error:
-        raise ConfigError(f"metrics: {error} is not known; expected names of METRICS in report/comparison.py") from None
+    metrics = _metrics(sweep.spec)
     grid, extra = tables.Grid(results, labels, metrics), tables.Grid(results, labels, EXTRA)
     title = sweep.spec.title
     texts = {

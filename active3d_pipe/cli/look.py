@@ -20,7 +20,7 @@ def status(run: Path = session.RUN, json: bool = session.JSON) -> None:
     """What a run holds: rounds, steps, seconds and bytes of every stage, what is stale, missing or pruned."""
     from active3d_pipe.pipeline.status import status as survey
 
-    found = survey(session.open_run(run))
+    found = survey(session.open_run(run, to_read=True))
     if json:
         console.out_json(found.to_json())
     else:
@@ -45,7 +45,7 @@ def inspect(
     if volume not in VOLUMES:
         hint = did_you_mean(volume, VOLUMES)
         raise ConfigError(f"--volume {volume}: no such volume{hint}; there are {', '.join(VOLUMES)}")
-    runner = session.open_run(run)
+    runner = session.open_run(run, to_read=True)
     store = runner.run_dir.store
     rounds = [k for k in store.rounds("uncertainty") if not store.is_pruned(NodeId("uncertainty", k))]
     if round is None and not rounds:
@@ -86,7 +86,7 @@ def view(run: Path = session.RUN) -> None:
     from active3d_pipe.errors import ConfigError
     from active3d_pipe.pipeline.stage import NodeId
 
-    runner = session.open_run(run)
+    runner = session.open_run(run, to_read=True)
     folders = [runner.run_dir.store.folder(NodeId("capture", k)) for k in runner.run_dir.store.rounds("capture")]
     found = [path for folder in folders for path in sorted(folder.glob("*.mcap"))]
     files = [str(path) for path in (*found, *sorted(run.glob("export/*.glb")), *sorted(run.glob("export/*.ply")))]

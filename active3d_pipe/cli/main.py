@@ -1,5 +1,7 @@
 """`active3d`: the entry point. Every error is one line and an exit code (`docs/commands.md`)."""
 
+import errno
+import os
 import sys
 import traceback
 import warnings
@@ -16,7 +18,7 @@ from active3d_pipe.cli.explore import evaluate, export, report, resume, run, run
 from active3d_pipe.cli.look import inspect, status, view
 from active3d_pipe.cli.manage import fork, gc, verify
 from active3d_pipe.cli.scene import app as scene
-from active3d_pipe.errors import Active3dError
+from active3d_pipe.errors import Active3dError, ConfigError
 
 app = typer.Typer(
     name="active3d", no_args_is_help=True, add_completion=True, rich_markup_mode=None, pretty_exceptions_enable=False,
@@ -49,6 +51,9 @@ app.add_typer(configure, name="config")
 
 def main() -> None:
     """Run the command line and exit with its code."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed (`2>&-`): no file of a run may take its place
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
     # Numba tells of an old TBB library although it goes on with OpenMP, which is what is wanted.
     warnings.filterwarnings("ignore", message="The TBB threading layer requires TBB")
     sys.exit(_main(sys.argv[1:]))
@@ -70,6 +75,9 @@ def _main(arguments: list[str]) -> int:
         if hasattr(error, "format_message"):  # a usage error of the command line itself
             console.say(f"active3d: {' '.join(error.format_message().split())} (see active3d --help)")
             return int(getattr(error, "exit_code", 2))
+        if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
+            console.say(f"active3d: {error.filename}: the name is too long for the file system; give a shorter one")
+            return ConfigError.exit_code
         return _internal(error)
 
 
@@ -93,7 +101,7 @@ def _internal(error: Exception) -> int:
 
 def _trace() -> None:
     if session.debug:
-        traceback.print_exc()
+        console.say(traceback.format_exc().rstrip())
 
 
 if __name__ == "__main__":

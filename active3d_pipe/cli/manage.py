@@ -42,7 +42,7 @@ def verify(
     from active3d_pipe.errors import DamageFound
     from active3d_pipe.pipeline.verify import verify as check
 
-    found = check(session.open_run(run), deep)
+    found = check(session.open_run(run, to_read=True), deep)
     if json:
         console.out_json(
             {

@@ -41,7 +41,7 @@ def with_files(config: "Config", layers: "Layers") -> "Config":
     if not walk:
         return config
     beside = (layers.folder_of("planning.trajectory") or Path.cwd()) / Path(walk).expanduser()
-    found = beside if beside.exists() else Path(walk).expanduser().resolve()
+    found = (beside if beside.exists() else Path(walk).expanduser()).resolve()
     if not found.exists():
         raise InputError(f"planning.trajectory = {walk!r}: no such file or run folder (looked at {beside}, {found})")
     return with_values(config, planning={"trajectory": str(found)})
@@ -99,14 +99,15 @@ def write_apartment(rooms: int, seed: int, file: Path, detail: float = 1.0) -> d
     """Write a generated apartment to `file` (.glb) and its `scene.json` beside it; returns the metadata.
 
     Raises:
-        OutputError: the folder holds the `scene.json` of another scene.
+        OutputError: the folder holds a `scene.json` that is not known to be of this file.
+        InputError: that `scene.json` cannot be read.
     """
     from active3d_pipe.sim.apartment import make_apartment
+    from active3d_pipe.sim.scene import read_sidecar
 
     sidecar = file.with_name("scene.json")
-    others = [p.name for p in file.parent.glob("*.*") if p.suffix in _SUFFIXES and p.name != file.name]
-    if sidecar.exists() and others:
-        raise OutputError(f"{sidecar}: belongs to {others[0]}; write {file.name} to a folder of its own")
+    if sidecar.exists() and read_sidecar(file).get("file") != file.name:
+        raise OutputError(f"{sidecar}: describes another scene; write {file.name} to a folder of its own")
     apartment = make_apartment(rooms, seed, detail=detail)
     metadata = {**apartment.metadata(), "file": file.name}
     with files.writing(file):

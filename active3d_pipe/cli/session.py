@@ -47,30 +47,35 @@ def watcher(budget: int = 0) -> "Watcher":
     return make_watcher(budget, quiet)
 
 
-def open_run(path: Path, overrides: Sequence[str] = (), watch: "Watcher | None" = None) -> "Runner":
-    """An existing run, with `--set` texts on top of its configuration (they are not written)."""
-    from active3d_pipe.pipeline.layers import Layers, read_toml
+def open_run(path: Path, overrides: Sequence[str] = (), *, to_read: bool = False) -> "Runner":
+    """An existing run, with `--set` texts on top of its configuration (they are not written).
+
+    Opened only `to_read`, settings that this version does not know are ignored with a warning.
+    """
+    from active3d_pipe.pipeline.layers import Layers, merge_overrides, read_toml
     from active3d_pipe.pipeline.run_dir import RUN_TOML, RunDir
 
     global run_folder
     run_dir = RunDir.open(path)
     layers = Layers()
     layers.merge(read_toml(path / RUN_TOML), str(path / RUN_TOML))
+    merge_overrides(layers, overrides)
     use_threads(layers)
 
     from active3d_pipe.pipeline.runner import Runner
 
-    config = run_config(path, overrides)
+    config = run_config(path, overrides, to_read=to_read)
     run_folder = path
-    return Runner(run_dir, registry(), config, watch if watch is not None else watcher(config.run.steps))
+    return Runner(run_dir, registry(), config, watcher(config.run.steps))
 
 
-def run_config(path: Path, overrides: Sequence[str]) -> "Config":
+def run_config(path: Path, overrides: Sequence[str], *, to_read: bool = False) -> "Config":
     """The configuration of a run folder with `--set` texts on top; files named there are found as `run` finds them."""
+    from active3d_pipe.cli.console import say
     from active3d_pipe.pipeline.config import Config, load_run_config
     from active3d_pipe.pipeline.run_dir import RUN_TOML
 
-    config = load_run_config(path / RUN_TOML, Config, overrides)
+    config = load_run_config(path / RUN_TOML, Config, overrides, warn=say if to_read else None)
     files = ("scene.file", "planning.trajectory")
     if any(text.partition("=")[0].strip() in files for text in overrides):
         from active3d_pipe.cli.scene_files import with_files

@@ -4,7 +4,7 @@ Layers, weakest first: defaults < preset < TOML file (which may name a preset) <
 `--set a.b=value`.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,7 +14,7 @@ from active3d_pipe.errors import ArtifactError, ConfigError
 from active3d_pipe.evaluation.config import EvaluationSettings
 from active3d_pipe.export.config import ExportSettings
 from active3d_pipe.mapping.config import MappingSettings
-from active3d_pipe.pipeline.config_errors import explain
+from active3d_pipe.pipeline.config_errors import explain, take_unknown
 from active3d_pipe.pipeline.config_text import resolved_toml
 from active3d_pipe.pipeline.layers import Layers, merge_overrides, read_layers, read_toml
 from active3d_pipe.pipeline.settings import RunSettings
@@ -57,12 +57,30 @@ def load_config(base: str | None, overrides: Iterable[str] = (), environ: Mappin
     return validate(read_layers(base, overrides, environ), Config)
 
 
-def load_run_config(run_toml: Path, model: type[AnySettings], overrides: Iterable[str] = ()) -> AnySettings:
-    """The configuration of a run folder, with `a.b=value` texts on top. The environment is not looked at."""
+def load_run_config(
+    run_toml: Path, model: type[AnySettings], overrides: Iterable[str] = (), warn: Callable[[str], None] | None = None
+) -> AnySettings:
+    """The configuration of a run folder, with `a.b=value` texts on top. The environment is not looked at.
+
+    Settings that another version wrote and this one does not know are left out when there is `warn` to tell it to.
+
+    Raises:
+        ArtifactError: there is no such file, or it holds such settings and there is no `warn`.
+        ConfigError: a value is wrong.
+    """
     if not run_toml.is_file():
         raise ArtifactError(f"{run_toml}: is missing; expected the configuration of a run")
+    values = read_toml(run_toml)
+    unknown = take_unknown(values, model)
+    if unknown and warn is None:
+        raise ArtifactError(
+            f"{run_toml}: {', '.join(unknown)} not known to this version; go on with the version that made the run, or "
+            "remove this from the file (what was made with it is made again)"
+        )
+    if unknown and warn is not None:
+        warn(f"{run_toml}: {', '.join(unknown)} not known to this version, ignored")
     layers = Layers()
-    layers.merge(read_toml(run_toml), str(run_toml))
+    layers.merge(values, str(run_toml))
     merge_overrides(layers, overrides)
     return validate(layers, model)
 

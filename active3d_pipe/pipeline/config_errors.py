@@ -43,6 +43,18 @@ def leaves(model: type[BaseModel], prefix: str = "") -> list[str]:
     return found
 
 
+def take_unknown(values: dict[str, Any], model: type[BaseModel], prefix: str = "") -> list[str]:
+    """Take out the values that a model has no field for; their dotted paths."""
+    taken: list[str] = []
+    for name, value in list(values.items()):
+        if name not in model.model_fields:
+            del values[name]
+            taken.append(f"{prefix}{name}")
+        elif isinstance(value, dict) and (below := section_of(model.model_fields[name].annotation)) is not None:
+            taken += take_unknown(value, below, f"{prefix}{name}.")
+    return taken
+
+
 def section_of(annotation: Any) -> type[BaseModel] | None:
     """The model that a field holds, if it holds one."""
     for candidate in (annotation, *get_args(annotation)):

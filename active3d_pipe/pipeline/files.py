@@ -8,6 +8,7 @@ import ctypes
 import errno
 import hashlib
 import os
+import secrets
 import shutil
 import sys
 from collections.abc import Iterator
@@ -108,11 +109,15 @@ def write_file(path: Path, data: bytes) -> None:
 
 
 def replace_file(path: Path, data: bytes) -> None:
-    """Write a file so that a reader, or a crash, sees either the old bytes or the new ones."""
-    aside = path.with_name(f".tmp-{path.name}")
-    write_file(aside, data)
-    failpoint()
-    os.replace(aside, path)
+    """Write a file so that a reader, or a crash, sees either the old bytes or the new ones; of two writers one wins."""
+    aside = path.with_name(f".tmp-{secrets.token_hex(4)}-{path.name}")
+    try:
+        write_file(aside, data)
+        failpoint()
+        os.replace(aside, path)
+    except BaseException:
+        aside.unlink(missing_ok=True)
+        raise
     sync_folder(path.parent)
 
 

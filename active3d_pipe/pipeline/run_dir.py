@@ -84,16 +84,16 @@ class RunDir:
     @classmethod
     def prepare(cls, path: Path, may_hold: Iterable[str] = ()) -> "RunDir":
         """The folder of a new or existing run; OutputError when it holds anything but a run, or `may_hold`."""
-        if path.exists() and not (path / MANIFEST).is_file():
-            if not path.is_dir():
-                raise OutputError(f"{path}: is a file; a run needs a folder, choose another with --out")
-            known = {LOCK, RUN_TOML, JOURNAL, *may_hold}
-            foreign = sorted(p.name for p in path.iterdir() if p.name not in known and not p.name.startswith(TMP))
-            if foreign:
-                raise OutputError(
-                    f"{path}: holds {foreign[0]!r} and is no run folder; choose an empty or new folder with --out"
-                )
         with files.writing(path):
+            if path.exists() and not (path / MANIFEST).is_file():
+                if not path.is_dir():
+                    raise OutputError(f"{path}: is a file; a run needs a folder, choose another with --out")
+                known = {LOCK, RUN_TOML, JOURNAL, *may_hold}
+                foreign = sorted(p.name for p in path.iterdir() if p.name not in known and not p.name.startswith(TMP))
+                if foreign:
+                    raise OutputError(
+                        f"{path}: holds {foreign[0]!r} and is no run folder; choose an empty or new folder with --out"
+                    )
             if not path.is_dir():
                 files.make_folder(path)
                 files.sync_folder(path.parent)

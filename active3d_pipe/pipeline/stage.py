@@ -3,9 +3,10 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
+if TYPE_CHECKING:
+    import numpy as np
 
 
 class NodeId(NamedTuple):
@@ -60,8 +61,10 @@ class StageContext:
         """Folder of an input artifact; KeyError if the stage did not declare it."""
         return self.inputs[NodeId(stage, round)]
 
-    def rng(self, purpose: str) -> np.random.Generator:
+    def rng(self, purpose: str) -> "np.random.Generator":
         """A generator of this node for one purpose; the same on every run."""
+        import numpy as np  # not before the number of its threads is set
+
         words = [int.from_bytes(purpose.encode()[i : i + 4], "little") for i in range(0, len(purpose), 4)]
         return np.random.default_rng(np.random.SeedSequence([self.seed, *words]))
 

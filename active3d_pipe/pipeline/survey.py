@@ -172,13 +172,18 @@ class Surveyor:
             return {}
         try:
             return stage.parameters(config, folders)
-        except (OSError, KeyError, Active3dError):
+        except (Active3dError, OSError, ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
             # A pruned input cannot be asked; what was true when the artifact was made still is, for inputs enter
             # the key by their digest.
             record = self.record(node)
             if record is not None and any(self.store.is_pruned(name) for name in folders):
                 return dict(record.parts["parameters"])
-            raise
+            if isinstance(error, Active3dError) or not folders:
+                raise
+            raise ArtifactError(
+                f"{node}: what it is made from cannot be read ({type(error).__name__}: {error}); `active3d verify "
+                f"--deep {self.store.root}` names the damage, `active3d resume {self.store.root}` makes it again"
+            ) from error
 
 
 def _is_hit(found: Mapping[NodeId, NodeState], node: NodeId) -> bool:

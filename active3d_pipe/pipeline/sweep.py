@@ -117,6 +117,8 @@ def read_spec(path: Path, variant_of: Callable[[str], Mapping[str, Any]]) -> Spe
             raise ConfigError(f"{path}: `{key}` is missing; expected a list")
     for key, kind in (("scenes", str), ("seeds", int), ("set", str), ("metrics", str)):
         _check_list(doc.get(key, []), kind, f"{path}: `{key}`")
+    if doc.get("seeds") == []:
+        raise ConfigError(f"{path}: `seeds` is empty; name at least one, or leave it out for seed 0")
     for key, kind in (("title", str), ("base", str), ("steps", int)):
         if type(doc.get(key, kind())) is not kind:
             raise ConfigError(f"{path}: `{key}` is {doc[key]!r}; expected {_KINDS[kind]}")
@@ -240,9 +242,13 @@ class Sweep:
 
     def _read(self) -> dict[str, Ended]:
         path = self.out / SWEEP
+        if not path.is_file():
+            return {}
         try:
-            document = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {"ended": {}}
-            return {name: Ended(**e) for name, e in document["ended"].items()}
+            ended = {name: Ended(**e) for name, e in json.loads(path.read_text(encoding="utf-8"))["ended"].items()}
+            if any(type(value) is not str for e in ended.values() for value in asdict(e).values()):
+                raise TypeError("expected text")
+            return ended
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
             raise ConfigError(f"{path}: cannot be read ({error}); remove it, finished runs are found again") from error
 

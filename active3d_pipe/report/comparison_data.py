@@ -50,7 +50,7 @@ def loop_seconds(run: Path) -> float | None:
             event = json.loads(line)
             if event.get("event") == "commit" and event.get("seconds") is not None:
                 newest[event["node"]] = float(event["seconds"])
-    except (OSError, ValueError):
+    except (OSError, ValueError, TypeError, KeyError, AttributeError):
         return None
     return sum(s for node, s in newest.items() if node.split("/")[0] in LOOP) or None
 

@@ -74,7 +74,7 @@ def load_scene(settings: SceneSettings) -> Scene:
     """
     path = readers.scene_path(settings.file)
     soup = readers.read_soup(path)
-    sidecar = _read_sidecar(path)
+    sidecar = read_sidecar(path)
     where = f"scene {path}"
 
     up_axis: str = settings.up_axis
@@ -124,8 +124,11 @@ def _start_pose(
     return placement.given_start_pose(surface, low, high, position, target, where), ()
 
 
-def _read_sidecar(path: Path) -> dict[str, Any]:
-    """The `scene.json` beside a scene file, or an empty dictionary."""
+def read_sidecar(path: Path) -> dict[str, Any]:
+    """The `scene.json` beside a scene file, or an empty dictionary when there is none or it is of another file.
+
+    Raises InputError when it cannot be read.
+    """
     sidecar = path.with_name("scene.json")
     if not sidecar.is_file():
         return {}

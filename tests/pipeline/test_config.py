@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from active3d_pipe.errors import ConfigError
+from active3d_pipe.errors import ArtifactError, ConfigError
 from active3d_pipe.pipeline.config import Config, load_config, load_run_config, resolve_toml, validate
 from active3d_pipe.pipeline.layers import Layers, parse_value, preset_names, read_layers
 
@@ -132,6 +132,18 @@ def test_the_resolved_configuration_reads_back_the_same(tmp_path: Path) -> None:
     (tmp_path / "run.toml").write_text(resolve_toml(config))
     assert load_run_config(tmp_path / "run.toml", Config) == config
     assert load_run_config(tmp_path / "run.toml", Config, ["run.steps=3"]).run.steps == 3
+
+
+def test_settings_of_another_version_in_a_run(tmp_path: Path) -> None:
+    file, said = tmp_path / "run.toml", []
+    file.write_text("old = 1\n[run]\nsteps = 7\nstepz = 3\n[mapping.window]\nwidth = 3\n[gone]\na.b = 1\n")
+    assert load_run_config(file, Config, warn=said.append).run.steps == 7
+    assert said == [f"{file}: old, run.stepz, mapping.window.width, gone not known to this version, ignored"]
+    with pytest.raises(ArtifactError, match=r"run\.stepz, .* not known to this version; go on with") as error:
+        load_run_config(file, Config)
+    assert "\n" not in str(error.value)
+    with pytest.raises(ConfigError, match=r"did you mean 'run\.steps'"):
+        load_run_config(file, Config, ["run.stepz=4"], said.append)
 
 
 def test_a_value_may_replace_a_table_and_the_other_way_round() -> None:

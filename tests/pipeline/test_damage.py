@@ -268,3 +268,15 @@ def test_a_state_is_unknown_while_its_parameters_cannot_be_read(run_path: Path) 
     assert (state.state, state.reasons) == (State.UNKNOWN, ("scene.glb: no such file",))
     with pytest.raises(ArtifactError, match=r"scene\.glb"):
         runner.run()
+
+
+@pytest.mark.parametrize("text", ["{}", '{"total": "x"}', "[]", "{", "null"])
+def test_an_input_that_a_key_cannot_be_made_of_is_one_line(run_path: Path, text: str) -> None:
+    (run_path / "capture/round_0000/capture.json").write_text(text)
+    state = open_runner(run_path).surveyor.assess(NodeId("capture", 1), 2)
+    assert state.state is State.UNKNOWN
+    said = rf"what it is made from cannot be read \(.*; `active3d verify --deep {run_path}` names the damage"
+    with pytest.raises(ArtifactError, match=said) as error:
+        open_runner(run_path).surveyor.parts(NodeId("capture", 1), 2)
+    assert "\n" not in str(error.value)
+    assert open_runner(run_path).run().ended  # damage that a digest shows is healed before it is read

@@ -57,6 +57,7 @@ def test_settings_are_what_the_command_line_takes(spec):
         ('variants = [1]', "expected a name"),
         ('variants = [{ name = "a", set = "x.y=1" }]', "`set` of variant 'a' is 'x.y=1'; expected a list"),
         ('seeds = "0"', "`seeds` is '0'; expected a list"),
+        ('seeds = []', "`seeds` is empty"),
         ('seeds = ["a"]', "each of them a whole number"),
         ('scenes = [3]', "each of them text"),
         ('set = "run.threads=1"', "`set` is 'run.threads=1'; expected a list"),
@@ -75,7 +76,10 @@ def test_mistakes_are_one_line(tmp_path, change, said):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("text", ["[]", "{}", '{"ended": {"a": 3}}', '{"ended": {"a": {"x": 1}}}', "{"])
+@pytest.mark.parametrize("text", [
+    "[]", "{}", '{"ended": {"a": {"state": "failed", "key": "k", "error": 3}}}',
+    '{"ended": {"a": 3}}', '{"ended": {"a": {"x": 1}}}', "{",
+])
 def test_a_damaged_account_of_a_sweep_is_one_line(spec, tmp_path, text):
     (tmp_path / s.SWEEP).write_text(text)
     with pytest.raises(ConfigError, match=r"cannot be read .*; remove it, finished runs are found again"):
