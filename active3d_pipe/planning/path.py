@@ -33,15 +33,6 @@ def turn_towards(R: np.ndarray, R_goal: np.ndarray, limit_rad: float) -> np.ndar
         s *= min(0.999, limit_rad / angle * SLACK)
 
 
-def turn_steps(R: np.ndarray, R_goal: np.ndarray, limit_rad: float) -> int:
-    """Number of steps that `turn_towards` needs."""
-    n = 0
-    while se3.rotation_angle(R, R_goal) > 1e-9 and n < 1000:
-        R = turn_towards(R, R_goal, limit_rad)
-        n += 1
-    return n
-
-
 def resample(points: np.ndarray, step_m: float) -> tuple[np.ndarray, np.ndarray]:
     """Positions along a polyline at equal arc length <= step_m, and that arc length; start excluded, end included."""
     lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)

@@ -73,13 +73,14 @@ def test_sphere_rewards_rank_views_as_the_exact_sum_does(scene):
 
 
 def test_each_voxel_counts_once(scene):
-    """Ten times the rays see no more than there is to see."""
+    """Sixteen times the rays see hardly more: what lies at the rims, no voxel a second time."""
     world, _, field = scene
+    camera = world.camera.scaled(4)
     T = se3.pose_from_yaw_pitch(np.array([0.5, 0.5, 1.0]), 0.5, 0.0)[None]
-    dense, normal = (exact_terms(field, T, world.camera, n)[0] for n in (1, None))
-    assert dense.reward == pytest.approx(normal.reward, rel=0.1)
-    everything = field.value.sum() + field.surface_value.sum()
-    assert dense.reward < everything
+    assert len(ray_fan(camera, 1)[2]) > 15 * len(ray_fan(camera, 4)[2])
+    dense, normal = (exact_terms(field, T, camera, n)[0] for n in (1, 4))
+    for name in ("reward", "surface", "gain_imp", "gain_exp", "num_visible", "num_open"):
+        assert 1 <= getattr(dense, name) / getattr(normal, name) < 1.1, name
 
 
 def test_what_has_been_seen_is_worth_nothing_any_more(scene):
