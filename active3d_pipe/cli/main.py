@@ -72,6 +72,9 @@ def _main(arguments: list[str]) -> int:
         console.say("active3d: stopped at once; everything committed is kept")
         return 130
     except Exception as error:
+        if type(error).__name__ == "NoArgsIsHelpError":
+            console.out(str(error))
+            return 2
         if hasattr(error, "format_message"):  # a usage error of the command line itself
             console.say(f"active3d: {' '.join(error.format_message().split())} (see active3d --help)")
             return int(getattr(error, "exit_code", 2))

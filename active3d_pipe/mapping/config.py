@@ -28,7 +28,7 @@ class WindowSettings(Settings):
     """Which keyframes are optimised together (eq. sw_energy)."""
 
     policy: Literal["viewpoint", "temporal"] = Field("viewpoint", description="nearest in viewpoint space or in time")
-    size: int = Field(10, ge=1, description="keyframes in the window, m")
+    size: int = Field(10, ge=1, description="number of keyframes in the window")
     replay: float = Field(0.3, ge=0, le=1, description="share of iterations on random older keyframes (E_reg)")
     submap_keyframes: int = Field(
         0, ge=0, description="so many keyframes later the Gaussians rest until the refinement, new ones begin; 0: never"

@@ -69,3 +69,9 @@ def test_commands_that_only_read_pass_over_settings_of_another_version(call, run
         code, out, err = call(*command)
         assert (code, out, err.count("\n")) == (3, "", 1)
         assert "planning.foresight not known to this version; go on with the version that made the run" in err
+
+
+@pytest.mark.parametrize("arguments", [(), ("scene",), ("config",)])
+def test_without_a_command_the_help_is_shown_as_it_is(call, arguments: tuple) -> None:
+    code, out, err = call(*arguments)
+    assert (code, err) == (2, "") and out.startswith("Usage: active3d") and out.count("\n") > 5
