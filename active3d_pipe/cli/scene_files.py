@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 GENERATED = "generated:"
 SCENES = "ACTIVE3D_SCENES"
-_SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
 _MESHES = ("scene.glb", "scene.gltf", "scene.obj", "scene.ply", "mesh.ply")
 
 
