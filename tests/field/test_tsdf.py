@@ -21,12 +21,28 @@ def fused(frames):
     return tsdf
 
 
+BLOCK_M = 8 * SETTINGS.voxel_m
+
+
+def blocks_near(frame):
+    """Set of the blocks that every second reading, or a truncation before or behind it, lies in."""
+    z = frame.depth.astype(float)[..., None] + SETTINGS.truncation_m * np.array([-1, 0, 1])
+    rays = projection.pixel_rays(frame.camera).astype(float) @ frame.T_world_camera[:3, :3].T
+    points = (rays[..., None, :] * z[..., None] + frame.T_world_camera[:3, 3])[::2, ::2]
+    return set(map(tuple, np.floor((points.reshape(-1, 3) - (LOW - 0.2)) / BLOCK_M).astype(int)))
+
+
 def reference(frames, centres):
-    """(N, 6) by the definition, voxel by voxel: mean distance, its weight, mean colour, its weight."""
+    """(N, 6) by the definition, voxel by voxel: mean distance, its weight, mean colour, its weight.
+
+    A frame says something of the blocks near its readings.
+    """
     out = np.zeros((len(centres), 6))
+    block = list(map(tuple, np.floor((centres - (LOW - 0.2)) / BLOCK_M).astype(int)))
     for f in frames:
+        near = blocks_near(f)
         uv, z = projection.project(centres, f.T_world_camera, f.camera)
-        at = np.flatnonzero(projection.in_image(uv, z, f.camera))
+        at = np.flatnonzero(projection.in_image(uv, z, f.camera) & [b in near for b in block])
         j, i = np.floor(uv[at]).astype(int).T
         gap = f.depth[i, j] - z[at]
         keep = (f.depth[i, j] > 0) & (gap >= -SETTINGS.truncation_m)
@@ -42,18 +58,25 @@ def reference(frames, centres):
     return out
 
 
-def test_one_frame_equals_the_reference(frames):
-    tsdf = TsdfField(LOW - 0.2, HIGH + 0.2, SETTINGS)
-    tsdf.integrate(frames[:1])
+def some_voxels(tsdf, count=4000):
+    """(centres, values) of voxels in allocated blocks."""
     rng = np.random.default_rng(0)
     blocks, voxels = (tsdf.state()[n] for n in ("blocks", "voxels"))
-    row, v = rng.integers(len(blocks), size=4000), rng.integers(512, size=4000)
+    row, v = rng.integers(len(blocks), size=count), rng.integers(512, size=count)
     ijk = blocks[row] * 8 + np.stack(np.unravel_index(v, (8, 8, 8)), axis=1)
-    centres = (tsdf.low + (ijk + 0.5) * SETTINGS.voxel_m).astype(np.float64)
-    expected, found = reference(frames[:1], centres), voxels[row, v]
+    return (LOW - 0.2 + (ijk + 0.5) * SETTINGS.voxel_m).astype(np.float64), voxels[row, v]
+
+
+@pytest.mark.parametrize(("count", "most"), [(1, 1), (6, 4), (24, 7)])
+def test_fused_frames_equal_the_reference(frames, count, most):
+    """Running means over the frames, whatever the order in which a voxel meets them."""
+    tsdf = TsdfField(LOW - 0.2, HIGH + 0.2, SETTINGS)
+    tsdf.integrate(frames[:count])
+    centres, found = some_voxels(tsdf)
+    expected = reference(frames[:count], centres)
     # float32 may put a voxel on the other side of a pixel's border
     same = (expected[:, 1] == found[:, 1]) & (expected[:, 5] == found[:, 5])
-    assert same.mean() > 0.995 and (found[:, 1] > 0).sum() > 500
+    assert same.mean() > 0.99 and (found[:, 1] > 0).sum() > 500 and found[:, 1].max() >= most
     close = np.abs(found - expected)[same].max(axis=1) < 1e-3
     assert close.mean() > 0.99
 
@@ -86,6 +109,45 @@ def test_fusion_in_parts_and_after_a_resume_has_the_same_bytes(fused, frames):
     assert all(a.tobytes() == second.state()[n].tobytes() for n, a in first.state().items())
     p = np.random.default_rng(2).uniform(LOW, HIGH, (3000, 3))
     assert np.array_equal(fused.query_sdf(p), first.query_sdf(p))
+
+
+@pytest.fixture
+def part(frames):
+    """The first frames fused in a part of the room; points whose eight voxels lie in blocks of that part."""
+    tsdf = TsdfField(LOW - 0.2, [0.4, *(HIGH[1:] + 0.2)], SETTINGS)
+    tsdf.integrate(frames[:12])
+    p = np.random.default_rng(3).uniform(LOW - 0.1, [0.4 - BLOCK_M, *HIGH[1:]], (3000, 3))
+    return tsdf, p
+
+
+def test_growth_leaves_what_was_fused(part):
+    """At once and bit by bit, by no multiple of a block."""
+    small, p = part
+    before, color = small.query_geometry(p), small.query_color(p)
+    assert before[0].std() > 0.01 and color.std() > 0.1
+    low, high = LOW - [0.53, 0.2, 0.71], np.add(HIGH, [0.9, 0.2, 0.37])
+    for grown in (small.grown(low, high), small.grown(LOW - 0.2, HIGH + 0.2).grown(low, high)):
+        assert np.array_equal(grown.box, [low, high]) and np.array_equal(grown.anchor, small.box)
+        assert len(grown.state()["blocks"]) == len(small.state()["blocks"])
+        for old, new in zip(before, grown.query_geometry(p)):
+            np.testing.assert_allclose(new, old, atol=1e-5)
+        np.testing.assert_allclose(grown.query_color(p), color, atol=1e-4)
+    assert np.array_equal(small.grown(LOW, HIGH - 1).box, [LOW - 0.2, [0.4, *(HIGH[1:] + 0.2)]])  # never smaller
+
+
+def test_a_grown_field_fuses_on_as_if_it_had_been_whole(part, fused, frames):
+    small, p = part
+    grown = small.grown(LOW - [0.53, 0.2, 0.2], HIGH + 0.2)
+    grown.integrate(frames[12:])
+    for whole, new in zip(fused.query_geometry(p), grown.query_geometry(p)):
+        # Rounding of the lowest corner puts a voxel in another pixel now and then.
+        assert (np.abs(new - whole) < 1e-4).mean() > 0.99
+    beyond = np.random.default_rng(4).uniform([0.7, *LOW[1:]], HIGH, (2000, 3))
+    assert (small.query_geometry(beyond)[1] == SETTINGS.sigma_prior_m).all()
+    assert (grown.query_geometry(beyond)[1] < SETTINGS.sigma_prior_m).mean() > 0.1
+    again = TsdfField(*grown.box, SETTINGS, grown.anchor)
+    again.load_state(grown.state())
+    assert again.query_sdf(p).tobytes() == grown.query_sdf(p).tobytes()
 
 
 def test_states_and_sizes_that_do_not_fit_are_refused(fused):
