@@ -12,7 +12,7 @@ from active3d_pipe.information.gain import FREE, OPEN, SURFACE
 from active3d_pipe.planning import kernels_reward, kernels_sight, reference_reward
 from active3d_pipe.structures import Camera, VoxelGrid
 
-GRID = VoxelGrid(np.array([-0.3, 0.2, 0.1]), 0.1, (15, 13, 11))
+GRID = VoxelGrid(np.array([-0.3, 0.2, 0.1]), 0.1, (20, 18, 16))
 CAMERA = Camera.from_fov(40, 30, 90)
 FAN = ray_fan(CAMERA, 3)[2]
 
@@ -66,14 +66,19 @@ def test_open_cells_equal_the_reference():
 
 
 def random_field(seed):
-    """What the kernels read of a `RewardField`, mostly free; `stops` also holds voxels that are no surface."""
+    """What the kernels read of a `RewardField`, empty in the middle, so that rays jump.
+
+    `stops` also holds open and free voxels.
+    """
     rng = np.random.default_rng(seed)
-    kind = random_kinds(seed, (0.86, 0.08, 0.06))
-    some = rng.random(kind.shape)
-    of_interest = (kind != FREE) | (some < 0.02)
+    kind = random_kinds(seed, (0.84, 0.09, 0.07))
+    stops = (kind == SURFACE) | (rng.random(kind.shape) < np.where(kind == OPEN, 0.4, 0.01))
+    kind[5:15, 4:14, 3:13] = FREE
+    stops[5:15, 4:14, 3:13] = False
+    of_interest = (kind != FREE) | stops
     return SimpleNamespace(
-        grid=GRID, max_range_m=1.2, enough_quality=0.5, quality_range_m=0.4, kind=kind.ravel(),
-        stops=((kind == SURFACE) | (some < 0.02)).astype(np.uint8).ravel(),
+        grid=GRID, max_range_m=1.5, enough_quality=0.5, quality_range_m=0.4, kind=kind.ravel(),
+        stops=stops.astype(np.uint8).ravel(),
         skip=distance_transform_cdt(~of_interest, "chessboard").clip(0, 12).astype(np.uint8).ravel(),
         clear=rng.integers(0, 256, GRID.size).astype(np.uint8), open_bits=rng.integers(0, 256, GRID.size, np.uint8),
         quality=rng.uniform(0, 0.6, GRID.size).astype(np.float32),
@@ -82,10 +87,10 @@ def random_field(seed):
 
 
 def random_poses(seed, count):
-    """Poses well inside the grid, in no special position: (origins (N, 3) voxels, rotations (N, 3, 3))."""
+    """Poses in the empty middle: (origins (N, 3) voxels, rotations (N, 3, 3))."""
     rng = np.random.default_rng(seed)
     poses = [
-        se3.pose_from_yaw_pitch(rng.uniform(4.1, 7.9, 3), rng.uniform(-3, 3), rng.uniform(-1, 1)) for _ in range(count)
+        se3.pose_from_yaw_pitch(rng.uniform(6.5, 11.5, 3), rng.uniform(-3, 3), rng.uniform(-1, 1)) for _ in range(count)
     ]
     return np.array([T[:3, 3] for T in poses], np.float32), np.array([T[:3, :3] for T in poses], np.float32)
 
@@ -102,8 +107,8 @@ def sight_of(field, stops, origin, rotation):
 
 def assert_nearly_equal(got, want):
     """Half way through a voxel a ray may lie on the border of its cells: rounding decides, seldom."""
-    assert (want > 0).sum() > 20
-    assert (got != want).sum() <= 0.06 * (want > 0).sum()
+    assert (want > 0).sum() > 15
+    assert (got != want).sum() <= 0.04 * (want > 0).sum()
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -149,8 +154,8 @@ def reference_looks(field, origins, rotations, weights):
 @pytest.mark.parametrize("seed", [3, 4])
 def test_count_looks_equals_the_reference(seed):
     field = random_field(seed)
-    origins, rotations = random_poses(seed, 5)
-    weights = np.array([1, 2, 0.5, 4, 8], np.float32)
+    origins, rotations = random_poses(seed, 8)
+    weights = 2.0 ** np.arange(-2, 6, dtype=np.float32)
     got = kernels_reward.count_looks(
         origins, rotations, weights, FAN.astype(np.float32), field.stops, field.skip, field.kind, field.quality,
         field.normal, field.clear, field.open_bits, GRID.shape, np.float32(0.1), np.float32(field.max_range_m),
@@ -158,6 +163,6 @@ def test_count_looks_equals_the_reference(seed):
     )
     want = reference_looks(field, origins, rotations, weights)
     settled = (want[0] > 0) & (field.kind == SURFACE)
-    assert settled.sum() > 5 and len(np.unique(want)) > 6
+    assert settled.sum() > 20 and field.skip.max() > kernels_sight.LEAST_JUMP and len(np.unique(want)) > 6
     assert_nearly_equal(got[0], want[0])
     assert_nearly_equal(got[1], want[1])
