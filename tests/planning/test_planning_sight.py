@@ -166,3 +166,5 @@ def test_count_looks_equals_the_reference(seed):
     assert settled.sum() > 20 and field.skip.max() > kernels_sight.LEAST_JUMP and len(np.unique(want)) > 6
     assert_nearly_equal(got[0], want[0])
     assert_nearly_equal(got[1], want[1])
+    # Where a ray ended once, an open voxel need not be settled by the next.
+    assert not got[0][(field.kind == OPEN) & (field.stops > 0)].any()

@@ -27,6 +27,14 @@ SWITCHES = {
     "without_risk_planning": {"planning.policy", "planning.lambda_risk", "planning.eta"},
     "without_uncertainty_keyframes": {"mapping.keyframes.policy"},
     "temporal_window": {"mapping.window.policy"},
+    "implicit_only": {
+        "mapping.representation", "mapping.keyframes.high_branches", "uncertainty.terms", "uncertainty.lambda_imp",
+        "uncertainty.lambda_exp",
+    },
+    "explicit_only": {
+        "mapping.representation", "mapping.geometry", "mapping.keyframes.high_branches", "uncertainty.terms",
+        "uncertainty.lambda_imp", "uncertainty.lambda_exp",
+    },
 }
 
 
@@ -73,6 +81,10 @@ def whole() -> UncertaintyVolume:
 
 def changed(a: UncertaintyVolume, b: UncertaintyVolume) -> set[str]:
     return {name for name in a.arrays if not np.array_equal(a[name], b[name])}
+
+
+def test_every_file_of_the_folder_is_here() -> None:
+    assert {file.name.removesuffix(".toml") for file in FOLDER.iterdir()} == set(SWITCHES)
 
 
 @pytest.mark.parametrize("name", SWITCHES)
