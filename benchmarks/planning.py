@@ -28,6 +28,8 @@ from active3d_pipe.information.gain import entropy_drop
 from active3d_pipe.planning import decide as decide_module
 from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.decide import bootstrap_decision
+from active3d_pipe.planning.policies import base, trajectory
+from active3d_pipe.planning.policies import context as context_module
 from active3d_pipe.planning.policies.context import PolicyContext
 from active3d_pipe.planning.policies.registry import make_policy
 from active3d_pipe.sim.config import CameraSettings, SceneSettings, SensorSettings
@@ -41,10 +43,12 @@ from active3d_pipe.uncertainty.config import UncertaintySettings
 from active3d_pipe.uncertainty.volume import make_grid
 
 NEAR_M = 0.05
-MODULES = {  # functions of planning.decide -> name in the table of times
-    "build_reward_field": "information", "begin_free_space": "risk field", "score": "candidates and reward",
-    "reward_density": "path", "plan_path": "path", "looks_along": "looks along the path",
+MODULES = {  # functions that decisions are made of -> name in the table of times
+    "build_reward_field": "information", "begin_free_space": "risk field", "build_free_space": "risk field",
+    "score": "candidates and reward", "reward_density": "path", "plan_path": "path",
+    "looks_along": "looks along the path",
 }  # fmt: skip
+CALLERS = (decide_module, context_module, base, trajectory)  # modules of the package that call them by name
 
 
 class CarvedWorld:
@@ -101,19 +105,23 @@ class CarvedWorld:
 
 
 def watch(seconds: dict[str, list[float]]) -> None:
-    """Let the parts of `decide` add up their time in seconds[name][-1]."""
+    """Let the parts of a decision add up their time in seconds[name][-1]; of what returns a function, its time too."""
 
     def timed(function: Any, name: str) -> Any:
         def call(*args: Any, **kwargs: Any) -> Any:
             start = time.perf_counter()
             out = function(*args, **kwargs)
             seconds[name][-1] += time.perf_counter() - start
-            return out
+            return timed(out, name) if callable(out) else out
 
         return call
 
     for attribute, name in MODULES.items():
-        setattr(decide_module, attribute, timed(getattr(decide_module, attribute), name))
+        callers = [module for module in CALLERS if hasattr(module, attribute)]
+        if not callers:
+            raise AttributeError(f"nothing calls {attribute} any more: MODULES is out of date")
+        for module in callers:
+            setattr(module, attribute, timed(getattr(module, attribute), name))
 
 
 def explore(

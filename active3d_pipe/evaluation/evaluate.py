@@ -103,21 +103,6 @@ def summary_rows(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
-def mean_and_std(runs: Sequence[Mapping[str, float | None]]) -> dict[str, dict[str, float | int | None]]:
-    """{metric: {mean, std, n, missing}} over runs that differ by seed; std as of a sample (n - 1)."""
-    names = list(dict.fromkeys(name for run in runs for name in run))
-    out: dict[str, dict[str, float | int | None]] = {}
-    for name in names:
-        values = np.array([run[name] for run in runs if run.get(name) is not None], dtype=np.float64)
-        out[name] = {
-            "mean": float(values.mean()) if len(values) else None,
-            "std": float(values.std(ddof=1)) if len(values) > 1 else None,
-            "n": len(values),
-            "missing": len(runs) - len(values),
-        }
-    return out
-
-
 def rows_to_csv(rows: Sequence[Mapping[str, Any]]) -> str:
     """CSV text with one column for every key that occurs, in order of appearance; None is an empty cell."""
     columns = list(dict.fromkeys(key for row in rows for key in row))

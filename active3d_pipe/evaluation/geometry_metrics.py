@@ -157,7 +157,7 @@ def _rename(metrics: Metrics, suffix: str, only: tuple[str, ...] = ()) -> Metric
 def surface_metrics(
     reconstruction: TriangleMesh, truth: TruthSurface, settings: EvaluationSettings, *, forms: tuple[str, ...] = ()
 ) -> Metrics:
-    """All distance metrics of a reconstruction, flat, named as in METHOD.md.
+    """All distance metrics of a reconstruction, flat; `names.py` says what each one means.
 
     Args:
         reconstruction: world m; an empty mesh scores a completion ratio of 0 and None for distances.

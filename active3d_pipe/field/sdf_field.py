@@ -12,7 +12,6 @@ from active3d_pipe.field.config import FieldSettings
 from active3d_pipe.field.encoders import Planes, make_encoders
 from active3d_pipe.field.encoding import BlobLayout, EncodeGrid, check_memory, lowest_nodes, node_counts
 from active3d_pipe.field.normals import unit_gradients
-from active3d_pipe.structures import VoxelGrid
 
 
 class FieldSamples(NamedTuple):
@@ -114,12 +113,6 @@ class SdfField(torch.nn.Module):
     def truncation_m(self) -> float:
         """Distance at which the SDF is truncated, m."""
         return self.settings.truncation_m
-
-    @property
-    def visit_grid(self) -> VoxelGrid:
-        """The cells that `visits` counts on."""
-        size = self.settings.grid_voxel_m
-        return VoxelGrid(self._origin + self.grid_first * size, size, self.visits.shape)
 
     def oneblob(self, points: np.ndarray) -> torch.Tensor:
         """(N, 3 * bins) OneBlob encoding of world points (N, 3) float32."""
@@ -233,7 +226,7 @@ class SdfField(torch.nn.Module):
         return unit_gradients(lambda at: self._decode(at, with_sigma=False)[:, 0], points, step_m)
 
     def count_visits(self, points: np.ndarray) -> None:
-        """Count training samples (N, 3) in the cells of `visit_grid`; counts saturate."""
+        """Count training samples (N, 3) in the cells of `visits`; counts saturate."""
         ijk = self._cells(points)
         inside = ((points >= self.low) & (points <= self.high)).all(axis=1)
         flat = np.ravel_multi_index(tuple(ijk[inside].T), self.visits.shape)
@@ -242,7 +235,7 @@ class SdfField(torch.nn.Module):
         visits[cells] = np.minimum(visits[cells].astype(np.int64) + counts, 2**31)
 
     def _cells(self, points: np.ndarray) -> np.ndarray:
-        """(N, 3) int64 cells of `visit_grid`, the nearest ones for points outside."""
+        """(N, 3) int64 cells of `visits`, the nearest ones for points outside."""
         ijk = np.floor((points - self._origin) * self._inv_grid).astype(np.int64) - self.grid_first
         return np.clip(ijk, 0, np.asarray(self.visits.shape) - 1)
 

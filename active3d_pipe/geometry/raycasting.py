@@ -49,7 +49,7 @@ def _load_libusb() -> None:
 
 
 class SurfaceIndex:
-    """A static triangle mesh that answers ray and nearest-surface queries; both sides of a face are hit."""
+    """A static triangle mesh that answers ray and distance queries; both sides of a face are hit."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         """Build the index of `vertices` (V, 3) float, m, and `faces` (F, 3) int."""
@@ -91,8 +91,3 @@ class SurfaceIndex:
         if len(points) == 0:
             return np.zeros(0, np.float32)
         return self._scene.compute_distance(self._tensor(points)).numpy()
-
-    def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Nearest surface points (N, 3) float32 and their faces (N,) uint32, of points (N, 3)."""
-        answer = self._scene.compute_closest_points(self._tensor(points))
-        return answer["points"].numpy(), answer["primitive_ids"].numpy()

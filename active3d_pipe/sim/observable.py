@@ -29,13 +29,11 @@ class FreeSpace:
     Attributes:
         grid: voxels over the scene's bounds.
         reachable: (X, Y, Z) bool, whether the sphere's centre can get to the voxel's centre.
-        radius_m: the sphere's radius.
         clearance: (X, Y, Z) float32 distance of voxel centres to the nearest surface, m.
     """
 
     grid: VoxelGrid
     reachable: np.ndarray
-    radius_m: float
     clearance: np.ndarray
 
     @property
@@ -77,7 +75,7 @@ def reachable_space(
     order = np.argsort(np.linalg.norm(centres - start, axis=1), kind="stable")
     clear = ~sim.surface.occluded(np.broadcast_to(start, centres.shape), centres)[order]
     first = near[order[int(np.argmax(clear))]]
-    return FreeSpace(grid, labels == labels[tuple(first)], radius_m, clearance)
+    return FreeSpace(grid, labels == labels[tuple(first)], clearance)
 
 
 def free_positions(

@@ -7,8 +7,6 @@ OpenCV optical frame: +x right, +y down, +z forward. Pixel (row i, column j) has
 import math
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from active3d_pipe.errors import ConfigError
 
 
@@ -55,8 +53,3 @@ class Camera:
         return replace(
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
-
-    @property
-    def matrix(self) -> np.ndarray:
-        """Intrinsic matrix K, (3, 3) float64."""
-        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])

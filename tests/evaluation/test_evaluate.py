@@ -128,9 +128,3 @@ def test_csv_has_one_column_a_key_and_empty_cells():
     text = ev.rows_to_csv([{"step": 1, "psnr": 20.5}, {"step": 2, "psnr": None, "note": "a,b"}])
     rows = list(csv.DictReader(io.StringIO(text)))
     assert rows == [{"step": "1", "psnr": "20.5", "note": ""}, {"step": "2", "psnr": "", "note": "a,b"}]
-
-
-def test_mean_and_std_over_seeds():
-    out = ev.mean_and_std([{"psnr": 20.0, "lpips": None}, {"psnr": 22.0, "lpips": 0.1}])
-    assert out["psnr"] == {"mean": 21.0, "std": pytest.approx(np.sqrt(2)), "n": 2, "missing": 0}
-    assert out["lpips"] == {"mean": 0.1, "std": None, "n": 1, "missing": 1}

@@ -175,3 +175,24 @@ def test_rounds_learn_the_view_from_every_pixel_and_from_means_of_them(stride: i
     small = target(frames[0], stride)
     assert small.rgb.shape == (CAMERA.height // stride, CAMERA.width // stride, 3) and small.rgb.max() <= 1
     assert small.camera.fx == pytest.approx(CAMERA.fx / stride)
+
+
+@pytest.mark.parametrize(
+    ("changed", "coupled"),
+    [({}, True), ({"representation": "implicit_only"}, False),
+     ({"representation": "explicit_only", "geometry": "tsdf"}, False)],
+)
+def test_only_the_hybrid_map_pulls_its_gaussians_to_the_field(changed: dict, coupled: bool, monkeypatch) -> None:
+    pulls = []
+
+    def pull(*args):
+        pulls.append(args)
+
+    monkeypatch.setattr("active3d_pipe.mapping.branches.coupling_gradient", pull)
+    settings = SETTINGS.model_copy(update={"coupling_every": 2, "refinement_field_iterations": 0} | changed)
+    hybrid = HybridMap.create(LOW, HIGH, settings, np.random.default_rng(0))
+    frames = frames_between(0, 3, 25.0)
+    update_map(hybrid, frames, None, 0, settings, np.random.default_rng(0), lambda _: None)
+    of_round = len(pulls)
+    refine(hybrid, frames, np.random.default_rng(0), lambda _: None)
+    assert (of_round > 0) == (len(pulls) > of_round) == coupled

@@ -107,6 +107,19 @@ def test_without_mlp_uncertainty_u_imp_reaches_no_sum(whole: UncertaintyVolume) 
     assert np.array_equal(high, volume["u_exp"] > config.mapping.keyframes.tau_high)
 
 
+@pytest.mark.parametrize(("name", "branch", "index"), [("implicit_only", "imp", 0), ("explicit_only", "exp", 1)])
+def test_with_one_branch_the_other_reaches_no_sum(
+    whole: UncertaintyVolume, name: str, branch: str, index: int
+) -> None:
+    config = config_of(name)
+    volume = two_rounds(config.uncertainty)
+    assert changed(whole, volume) == {"u_final", "entropy"}
+    assert np.flatnonzero(volume.fusion["alphas"]).tolist() == [index]
+    assert np.array_equal(volume["entropy"], volume[f"entropy_{branch}"])
+    keyframes = config.mapping.keyframes
+    assert np.array_equal(Information(volume, keyframes).high, volume[f"u_{branch}"] > keyframes.tau_high)
+
+
 @pytest.mark.parametrize(
     ("name", "deaf_to", "hears"),
     [("without_depth_uncertainty", "depth_error", "color_error"),

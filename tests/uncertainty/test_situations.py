@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from uncertainty_room import BOX_HIGH, CAMERA, SIZE, field, frames, gaussians_on, residual, room_grid, room_sdf
+from uncertainty_room import BOX_HIGH, CAMERA, SIZE, field, frames, gaussians_on, pose, residual, room_grid, room_sdf
 
-from active3d_pipe.geometry import projection, voxel_traversal
-from active3d_pipe.information.gain import visible_information
+from active3d_pipe.geometry import projection
+from active3d_pipe.planning.config import PlanningSettings
+from active3d_pipe.planning.reward import build_reward_field, exact_terms
 from active3d_pipe.uncertainty.config import UncertaintySettings
 from active3d_pipe.uncertainty.volume import compute_volume
 
@@ -27,10 +28,10 @@ def volume(fs, previous=None, *, query=field, views=None, settings=S):
     )
 
 
-def reward(v, T):
-    """Expected gain of a view by the planner's model of it: visible voxels up to solid ones."""
-    visible = voxel_traversal.visible_voxels(v["occupancy"] > 0.5, GRID, T, CAMERA, max_range_m=5.0)
-    return visible_information(v.arrays, visible, CAMERA)
+def reward(v, T, walked=()):
+    """`GainTerms` of the view from T as the planner scores it, after the poses walked so far."""
+    walked = np.array(walked).reshape(-1, 4, 4)
+    return exact_terms(build_reward_field(v, walked, CAMERA, PlanningSettings()), T[None], CAMERA)[0]
 
 
 @pytest.fixture(scope="module")
@@ -76,16 +77,19 @@ def test_c_d_intricate_surface_stands_out_among_seen_ones():
 def test_f_h_phantom_structure_behind_the_walls_draws_no_attention(looked_around):
     """(f, h) the field invents a second room behind the wall: no view is worth more for it."""
 
-    def phantom(points):
+    def phantom(points, beyond=SIZE[0] + 0.06):
         sdf, sigma = field(points)
-        behind = points[:, 0] > SIZE[0] + 0.06
+        behind = points[:, 0] > beyond
         return np.where(behind, 0.05 * np.sin(40 * points[:, 1]), sdf), np.where(behind, 0.3, sigma)
 
-    v = volume(frames(AROUND), query=phantom)
-    for f in frames((-20, 0, 20), first_step=20):
-        with_phantom, without = reward(v, f.T_world_camera), reward(looked_around, f.T_world_camera)
-        assert with_phantom.num_visible > 300
-        assert with_phantom.reward == pytest.approx(without.reward, rel=0.02, abs=0.05)
+    v, away = volume(frames(AROUND), query=phantom), (150, 180, 210)
+    # With the wall in the map; and of a half of the room that nobody saw: there sight goes on into the invention.
+    dreamt = volume(frames(away), query=lambda p: phantom(p, 1.7))
+    for invented, plain in ((v, looked_around), (dreamt, volume(frames(away)))):
+        for f in frames((-20, 0, 20), first_step=20):
+            with_phantom, without = reward(invented, f.T_world_camera), reward(plain, f.T_world_camera)
+            assert with_phantom.num_visible > 300
+            assert with_phantom.reward == pytest.approx(without.reward, rel=0.02, abs=0.05)
     behind = CENTRES[..., 0] > SIZE[0] + 0.06
     hidden = behind & (v["hit_evidence"] == 0)
     # It does not come and go either: the field's moods there never reach u_time.
@@ -130,19 +134,26 @@ def window(f, low=(-1.0, 0.4, 0.7), high=(0.1, 1.9, 1.6)):
 
 def test_missing_depth_loses_attraction_after_looks_in_vain():
     """A window gives no depth however often one looks: each round in vain halves what is expected there."""
-    v, rewards, u = None, [], []
+    v, u, walked, by_volume, planned, ahead = None, [], [], [], [], []
     for k in range(4):
         fs, lost = zip(*(window(f) for f in frames((150, 180, 210), first_step=3 * k)))
         assert lost[1].mean() > 0.05
         v = volume(fs, v)
+        walked += [f.T_world_camera for f in fs]
         pane = (v["vain_looks"] > k) & ~v.observed
         assert pane.sum() > 20
         u.append(v["u_imp"][pane].mean())
-        rewards.append(visible_information(v.arrays, np.flatnonzero(pane), CAMERA).reward)
+        by_volume.append(reward(v, pose(180)).reward)
+        planned.append(reward(v, pose(180), walked).reward)
+        ahead.append(reward(v, pose(0), walked).reward)
     for now, before in zip(u[1:], u):
         assert now == pytest.approx(before / 2, rel=0.05)
-    assert rewards[3] < 0.25 * rewards[0]
+    assert by_volume[3] < 0.25 * by_volume[0]
+    # The planner counts the looks itself, too.
+    assert planned[0] < 0.5 * by_volume[0] and planned[3] < 0.1 * planned[0]
     # Unseen space elsewhere keeps all of its attraction.
+    assert ahead[0] > 5 * by_volume[0]
+    assert ahead[1:] == pytest.approx(ahead[:1] * 3, rel=0.01)
     elsewhere = ~v.observed & (v["vain_looks"] == 0)
     assert elsewhere.sum() > 1000
     assert v["u_imp"][elsewhere].min() == 1

@@ -20,29 +20,28 @@ GROUP = "active3d.policies"
 
 
 class Entry(NamedTuple):
-    """Where a policy is: `module:Class` relative to this package; whether it reads the map; one line about it."""
+    """Where a policy is: `module:Class` relative to this package; whether it reads the map."""
 
     path: str
     needs_map: bool
-    about: str
 
 
 POLICIES: dict[str, Entry] = {
-    "active3d": Entry("active3d:Active3D", False, "hierarchical uncertainty, information gain per step, risk"),
-    "activeinr": Entry("activeinr:ActiveInr", True, "weight perturbation of the whole SDF field (ActiveINR, ANM)"),
-    "anm_s": Entry("anm_s:AnmS", True, "perturbation of the SDF decoder on a Voronoi graph (ANM-S)"),
-    "naruto": Entry("naruto:Naruto", False, "learned uncertainty summed over visible surface (NARUTO)"),
-    "aggregation": Entry("aggregation:Aggregation", False, "NARUTO's search over the fused uncertainty volume"),
-    "activesplat": Entry("activesplat:ActiveSplat", True, "Voronoi graph, opacity, look-around (ActiveSplat)"),
-    "activegamer": Entry("activegamer:ActiveGamer", True, "unseen pixels of rendered views, two stages (ActiveGAMER)"),
-    "fisherrf": Entry("fisherrf:FisherRF", True, "expected information gain by the diagonal Fisher matrix (FisherRF)"),
-    "activegs": Entry("activegs:ActiveGS", True, "confidence of primitives and unexplored space (ActiveGS)"),
-    "gsplanner": Entry("gsplanner:GSPlanner", True, "unobserved volume in front of the rendered depth (GS-Planner)"),
-    "frontier": Entry("frontier:Frontier", False, "nearest border between free and unknown space"),
-    "volume": Entry("volume:UnknownVolume", False, "most unknown voxels in view per step"),
-    "random": Entry("random_views:RandomViews", False, "a random free pose, then the next"),
-    "sweep": Entry("sweep:Sweep", False, "boustrophedon over a fixed lattice"),
-    "trajectory": Entry("trajectory:Trajectory", False, "poses recorded in a file or by another run"),
+    "active3d": Entry("active3d:Active3D", False),  # hierarchical uncertainty, information gain per step, risk
+    "activeinr": Entry("activeinr:ActiveInr", True),  # weight perturbation of the whole SDF field (ActiveINR, ANM)
+    "anm_s": Entry("anm_s:AnmS", True),  # perturbation of the SDF decoder on a Voronoi graph (ANM-S)
+    "naruto": Entry("naruto:Naruto", False),  # learned uncertainty summed over visible surface (NARUTO)
+    "aggregation": Entry("aggregation:Aggregation", False),  # NARUTO's search over the fused uncertainty volume
+    "activesplat": Entry("activesplat:ActiveSplat", True),  # Voronoi graph, opacity, look-around (ActiveSplat)
+    "activegamer": Entry("activegamer:ActiveGamer", True),  # unseen pixels of rendered views, two stages (ActiveGAMER)
+    "fisherrf": Entry("fisherrf:FisherRF", True),  # expected information gain by the diagonal Fisher matrix (FisherRF)
+    "activegs": Entry("activegs:ActiveGS", True),  # confidence of primitives and unexplored space (ActiveGS)
+    "gsplanner": Entry("gsplanner:GSPlanner", True),  # unobserved volume in front of the rendered depth (GS-Planner)
+    "frontier": Entry("frontier:Frontier", False),  # nearest border between free and unknown space
+    "volume": Entry("volume:UnknownVolume", False),  # most unknown voxels in view per step
+    "random": Entry("random_views:RandomViews", False),  # a random free pose, then the next
+    "sweep": Entry("sweep:Sweep", False),  # boustrophedon over a fixed lattice
+    "trajectory": Entry("trajectory:Trajectory", False),  # poses recorded in a file or by another run
 }
 
 
