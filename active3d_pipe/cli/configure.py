@@ -18,7 +18,7 @@ def show(
 
     resolved = load_config(config, set_)
     if json:
-        console.out_json(resolved.model_dump(mode="json"))
+        console.out_json({"schema": "active3d.config/1", **resolved.model_dump(mode="json")})
     else:
         console.out(resolve_toml(resolved).rstrip())
 
@@ -37,6 +37,6 @@ def presets(json: bool = session.JSON) -> None:
     from active3d_pipe.pipeline.layers import preset_names
 
     if json:
-        console.out_json(preset_names())
+        console.out_json({"schema": "active3d.presets/1", "presets": preset_names()})
     else:
         console.out("\n".join(preset_names()))

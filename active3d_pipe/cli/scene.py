@@ -57,7 +57,7 @@ def make(
         raise ConfigError(f"--out {out}: expected a name that ends in .glb")
     metadata = write_apartment(rooms, seed, out, detail)
     if json:
-        console.out_json({**metadata, "file": str(out)})
+        console.out_json({"schema": "active3d.apartment/1", **metadata, "file": str(out)})
     else:
         extent = " x ".join(f"{v:.1f}" for v in metadata["extent_m"])
         console.out(f"{out}: {rooms} rooms, {extent} m, {metadata['triangles']} triangles")

@@ -94,12 +94,16 @@ def curve_settings(settings: EvaluationSettings) -> EvaluationSettings:
 
 
 def summary_rows(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Rows {name, value, unit, better, explanation} of all metrics that have a description, in their order."""
+    """Rows {name, value, unit, better, explanation} of all metrics that have a description, in their order.
+
+    Shares are shares of 1, and their unit says so.
+    """
     rows = []
     for name, value in metrics.items():
         about = describe(name)
         if about:
-            rows.append({"name": name, "value": value, **about})
+            unit = "of 1" if about["unit"] == "%" else about["unit"]
+            rows.append({"name": name, "value": value, **about, "unit": unit})
     return rows
 
 

@@ -4,7 +4,7 @@ from typing import TypedDict
 
 
 class About(TypedDict):
-    """Unit ("" = none), "higher" | "lower" | "" and an explanation in one sentence."""
+    """Unit ("" = none; "%" = a share of 1), "higher" | "lower" | "" and an explanation in one sentence."""
 
     unit: str
     better: str

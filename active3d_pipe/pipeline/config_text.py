@@ -1,10 +1,11 @@
 """A configuration as commented TOML: the form of `run.toml` and of `config show`."""
 
 import json
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 import tomli_w
 from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 
 
 def resolved_toml(config: BaseModel) -> str:
@@ -24,9 +25,9 @@ def _section(section: BaseModel, path: str, lines: list[str]) -> None:
         if isinstance(value, BaseModel):
             below.append((name, value))
         elif value is not None:
-            lines.append(f"{name} = {inline(values[name])}{_comment(info.description)}")
+            lines.append(f"{name} = {inline(values[name])}{_comment(info)}")
         else:
-            lines.append(f"# {name} is not set{_comment(info.description)}")
+            lines.append(f"# {name} is not set{_comment(info)}")
     for name, value in below:
         _section(value, f"{path}.{name}" if path else name, lines)
 
@@ -40,5 +41,14 @@ def inline(value: Any) -> str:
     return tomli_w.dumps({"x": value}).removeprefix("x = ").rstrip("\n")
 
 
-def _comment(description: str | None) -> str:
-    return f"  # {description}" if description else ""
+def _comment(info: FieldInfo) -> str:
+    parts = [info.description or "", " | ".join(_words(info.annotation))]
+    text = "; words: ".join(part for part in parts if part)
+    return f"  # {text}" if text else ""
+
+
+def _words(annotation: Any) -> list[str]:
+    """The words that a setting, or an item of its list, may be."""
+    if get_origin(annotation) is Literal:
+        return [inline(word) for word in get_args(annotation)]
+    return [word for inner in get_args(annotation) for word in _words(inner)]

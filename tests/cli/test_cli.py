@@ -202,9 +202,12 @@ def test_config_show_and_schema(call) -> None:
     values = tomllib.loads(out)
     assert (code, values["run"]["seed"], values["camera"]["width"]) == (0, 5, 320)
     assert "# seed that every random choice" in out
+    assert 'terms = ["imp", "exp", "time"]  # terms that enter u_final; words: "imp" | "exp" | "time"' in out
     code, out, _ = call("config", "schema")
     assert json.loads(out)["properties"].keys() >= {"run", "scene", "camera", "mapping", "planning"}
     assert "demo" in call("config", "presets")[1].split()
+    for verb in ("show", "presets"):
+        assert json.loads(call("config", verb, "--json")[1])["schema"].startswith("active3d.")
 
 
 def test_inspect_draws_a_volume(call, run: Path, tmp_path: Path) -> None:

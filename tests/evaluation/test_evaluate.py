@@ -124,6 +124,11 @@ def test_every_metric_is_explained_and_json_able():
     assert json.loads(json.dumps(m, allow_nan=False)) == m
 
 
+def test_a_share_is_listed_as_a_share_of_one():
+    rows = ev.summary_rows({"completion_ratio_surface": 0.98, "psnr": 30.0, "not described": 1})
+    assert [(row["value"], row["unit"]) for row in rows] == [(0.98, "of 1"), (30.0, "dB")]
+
+
 def test_csv_has_one_column_a_key_and_empty_cells():
     text = ev.rows_to_csv([{"step": 1, "psnr": 20.5}, {"step": 2, "psnr": None, "note": "a,b"}])
     rows = list(csv.DictReader(io.StringIO(text)))
