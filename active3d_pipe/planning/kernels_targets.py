@@ -78,7 +78,8 @@ def best_viewpoints(
                 if cos <= ZERO:
                     continue
                 look *= cos
-            if look <= best and look <= best_rate * (steps[p] + view_steps):
+            beaten = min(best, best_rate * (steps[p] + view_steps))  # a look worth no more changes nothing
+            if look <= beaten:
                 continue
             m = pieces * int(np.ceil(distance))
             passed = ONE
@@ -95,7 +96,7 @@ def best_viewpoints(
                 elif v != target and v != last:
                     last = v
                     passed *= through[v]
-                if passed < np.float32(0.05):
+                if passed < np.float32(0.05) or look * passed <= beaten:
                     break
             look *= passed
             if passed >= np.float32(0.05):
