@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -103,42 +104,14 @@ def score(  # noqa: PLR0913  (what a decision knows, by name)
     """
     R = T_world_camera[:3, :3]
     directions = view_directions(camera, settings.num_yaws, settings.pitches_deg)
-    num_views = len(directions.rotations)
-
-    # Turning is the same from every position, so it is measured once a view.
-    turning = view_cost_steps(np.zeros(num_views), R, directions.rotations, motion)
-
-    def utilities(voxels: np.ndarray, rewards: np.ndarray) -> np.ndarray:
-        walking = space.cost[tuple(voxels.T)] / np.float32(motion.max_step_m)
-        return utility_rate(rewards, np.maximum(walking[:, None], turning[None]), settings)
-
-    # The place where the agent stands is always a candidate: turning is the cheapest motion.
-    seeing = target_positions(space, field, motion, settings)
-    hidden = [hidden_positions(space, field, motion, settings, hidden_pairs, turn) for turn in turns]
-    voxels = np.concatenate([space.start[None], coarse_positions(space, settings), seeing, *hidden])
-    voxels = np.unique(voxels, axis=0)
-    rewards = sphere_rewards(field, positions_world(space, voxels, T_world_camera), directions)
-    utility = utilities(voxels, rewards)
-    top = np.argsort(-utility.max(axis=1), kind="stable")[: settings.refine_top]
-    fine = fine_positions(space, voxels[top], settings)
-    fine = fine[~(fine[:, None] == voxels[None]).all(axis=-1).any(axis=1)]
-    if len(fine):
-        fine_rewards = sphere_rewards(field, positions_world(space, fine, T_world_camera), directions)
-        voxels, rewards = np.concatenate([voxels, fine]), np.concatenate([rewards, fine_rewards])
-        utility = np.concatenate([utility, utilities(fine, fine_rewards)])
-    num_candidates = rewards.size
-    if turns:
-        again = _worth_another_look(rewards, utility, SECOND_LOOKS * settings.exact_top)
-        voxels, finer = voxels[again], view_directions(camera, settings.num_yaws, settings.pitches_deg, FINE_ELEVATIONS)
-        rewards = sphere_rewards(field, positions_world(space, voxels, T_world_camera), finer)
-        utility = utilities(voxels, rewards)
-    chosen = _shortlist(voxels, rewards, utility, directions, settings)
-    poses = np.stack([np.eye(4)] * len(chosen)) if chosen else np.zeros((0, 4, 4))
+    found = _estimate(space, field, T_world_camera, camera, motion, settings, directions, hidden_pairs, turns)
+    chosen = _shortlist(found.voxels, found.rewards, found.utility, directions, settings)
     at = np.array([p for p, _ in chosen], dtype=np.int64)
+    poses = np.tile(np.eye(4), (len(chosen), 1, 1))
     if chosen:
         poses[:, :3, :3] = directions.rotations[[v for _, v in chosen]]
-        poses[:, :3, 3] = positions_world(space, voxels[at], T_world_camera)
-    goal_voxels = voxels[at]
+        poses[:, :3, 3] = positions_world(space, found.voxels[at], T_world_camera)
+    goal_voxels = found.voxels[at]
     committed = np.zeros(len(chosen), bool)
     old = _previous_goal(previous, space)
     if old is not None:
@@ -163,8 +136,50 @@ def score(  # noqa: PLR0913  (what a decision knows, by name)
     order = np.argsort(-final, kind="stable")
     return Pool(
         poses[order], goal_voxels[order], [terms[i] for i in order], travel[order], final[order], committed[order],
-        num_candidates, voxels, rewards.max(axis=1),
+        found.num_candidates, found.voxels, found.rewards.max(axis=1),
     )
+
+
+class _Estimates(NamedTuple):
+    """Estimated views: (P, 3) int64 `voxels`, (P, V) `rewards` and `utility` there; `num_candidates` asked in all."""
+
+    voxels: np.ndarray
+    rewards: np.ndarray
+    utility: np.ndarray
+    num_candidates: int
+
+
+def _estimate(  # noqa: PLR0913  (what `score` knows, and the directions)
+    space: FreeSpace, field: RewardField, T_world_camera: np.ndarray, camera: Camera, motion: MotionSettings,
+    settings: PlanningSettings, directions: Directions, hidden_pairs: int, turns: Sequence[int],
+) -> _Estimates:
+    """All views from a coarse lattice and from what is worth seeing, the best places' surroundings, a second look."""
+    # Turning is the same from every position, so it is measured once a view.
+    turning = view_cost_steps(np.zeros(len(directions.rotations)), T_world_camera[:3, :3], directions.rotations, motion)
+
+    def estimates(voxels: np.ndarray, rays: Directions) -> tuple[np.ndarray, np.ndarray]:
+        rewards = sphere_rewards(field, positions_world(space, voxels, T_world_camera), rays)
+        walking = space.cost[tuple(voxels.T)] / np.float32(motion.max_step_m)
+        return rewards, utility_rate(rewards, np.maximum(walking[:, None], turning[None]), settings)
+
+    # The place where the agent stands is always a candidate: turning is the cheapest motion.
+    seeing = target_positions(space, field, motion, settings)
+    hidden = [hidden_positions(space, field, motion, settings, hidden_pairs, turn) for turn in turns]
+    voxels = np.unique(np.concatenate([space.start[None], coarse_positions(space, settings), seeing, *hidden]), axis=0)
+    rewards, utility = estimates(voxels, directions)
+    top = np.argsort(-utility.max(axis=1), kind="stable")[: settings.refine_top]
+    fine = fine_positions(space, voxels[top], settings)
+    fine = fine[~(fine[:, None] == voxels[None]).all(axis=-1).any(axis=1)]
+    if len(fine):
+        more = estimates(fine, directions)
+        voxels = np.concatenate([voxels, fine])
+        rewards, utility = np.concatenate([rewards, more[0]]), np.concatenate([utility, more[1]])
+    num_candidates = rewards.size
+    if turns:
+        voxels = voxels[_worth_another_look(rewards, utility, SECOND_LOOKS * settings.exact_top)]
+        finer = view_directions(camera, settings.num_yaws, settings.pitches_deg, FINE_ELEVATIONS)
+        rewards, utility = estimates(voxels, finer)
+    return _Estimates(voxels, rewards, utility, num_candidates)
 
 
 def _worth_another_look(rewards: np.ndarray, utility: np.ndarray, most: int) -> np.ndarray:
@@ -228,56 +243,3 @@ def reward_density(pool: Pool, space: FreeSpace) -> np.ndarray:
     total, weight = spread_values(pool.positions, pool.best_rewards, kernel / kernel.sum(), space.grid.shape)
     out = np.where(weight > 1e-6, total / np.maximum(weight, 1e-6), 0)
     return (out / max(float(out.max()), 1e-9)).astype(np.float32)
-
-
-def looks_along(
-    points: np.ndarray,
-    R_start: np.ndarray,
-    T_goal: np.ndarray,
-    field: RewardField,
-    directions: Directions,
-    motion: MotionSettings,
-    spacing_m: float,
-) -> list[tuple[float, np.ndarray]]:
-    """Which way to look along a path (M, 3): (arc length, rotation), the goal's last.
-
-    The integral of the reward along the path (eq. risk_path) for the looking directions: dynamic programming over
-    the view directions at waypoints, where consecutive directions lie within what the steps between them can turn.
-    """
-    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    arc = np.concatenate([[0], np.cumsum(lengths)])
-    goal = (float(arc[-1]), T_goal[:3, :3])
-    n = int(arc[-1] / spacing_m)
-    if n < 1:
-        return [goal]
-    s = arc[-1] * np.arange(1, n + 1) / (n + 1)
-    waypoints = np.stack([np.interp(s, arc, points[:, i]) for i in range(3)], axis=-1)
-    rewards = sphere_rewards(field, waypoints, directions).astype(np.float64)
-    turn = np.radians(motion.max_turn_deg) * max(1.0, np.floor(arc[-1] / (n + 1) / motion.max_step_m))
-    R = directions.rotations
-    angle, flat = directions.angles, R.reshape(len(R), 9)
-
-    def off(other: np.ndarray) -> np.ndarray:
-        return np.arccos(np.clip((flat @ other.ravel() - 1) / 2, -1, 1))
-
-    from_start, to_goal = off(R_start), off(T_goal[:3, :3])
-    # Turning farther than the steps allow costs steps on the spot: forbidden unless nothing else is possible.
-    penalty = 1e3 * (1 + rewards.max())
-
-    def over(a: np.ndarray) -> np.ndarray:
-        return penalty * np.maximum(0, a - turn - 1e-6)
-
-    value = rewards[0] - over(from_start)
-    back = []
-    for w in range(1, n):
-        reach = value[:, None] - over(angle)
-        back.append(reach.argmax(axis=0))
-        value = reach.max(axis=0) + rewards[w]
-    v = int((value - over(to_goal)).argmax())
-    chosen = [v]
-    for pointer in reversed(back):
-        v = int(pointer[v])
-        chosen.append(v)
-    views = [(float(a), R[v]) for a, v in zip(s, reversed(chosen), strict=True)]
-    return [*views, goal]
-

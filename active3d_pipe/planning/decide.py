@@ -11,9 +11,10 @@ import numpy as np
 
 from active3d_pipe.errors import InputError
 from active3d_pipe.planning.candidates import Directions, view_directions
-from active3d_pipe.planning.choice import Pool, looks_along, reward_density, score, utility_rate, view_cost_steps
+from active3d_pipe.planning.choice import Pool, reward_density, score, utility_rate, view_cost_steps
 from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.free_space import FreeSpace, begin_free_space, build_free_space
+from active3d_pipe.planning.looks import looks_along
 from active3d_pipe.planning.outcome import account_terms, expected_along
 from active3d_pipe.planning.path import look_around, step_path
 from active3d_pipe.planning.reward import RewardField, build_reward_field, exact_terms
