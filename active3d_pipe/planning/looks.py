@@ -57,4 +57,3 @@ def looks_along(
         chosen.append(v)
     views = [(float(a), R[v]) for a, v in zip(s, reversed(chosen), strict=True)]
     return [*views, goal]
-
