@@ -57,7 +57,9 @@ def resume(
 
 
 def run_stage(
-    stage: str = typer.Argument(..., help="Name of the stage.", show_default=False),
+    stage: str = typer.Argument(
+        ..., help="capture, mapping, uncertainty, planning, export, evaluation or report.", show_default=False
+    ),
     run: Path = typer.Option(..., "--run", help="Folder of the run.", show_default=False),
     round: int = typer.Option(None, "--round", help="Round; default: the newest that can run.", show_default=False),
     until: str = typer.Option(None, "--until", help="Go on to this later stage.", show_default=False),

@@ -29,10 +29,12 @@ def status(run: Path = session.RUN, json: bool = session.JSON) -> None:
 
 def inspect(
     run: Path = session.RUN,
-    volume: str = typer.Option("u_final", "--volume", help="Name of a volume of the uncertainty stage."),
+    volume: str = typer.Option("u_final", "--volume", help="u_final, u_imp, u_exp, occupancy, entropy, sdf ..."),
     round: int = typer.Option(None, "--round", help="Round; default: the newest.", show_default=False),
     slice_: str = typer.Option(None, "--slice", metavar="AXIS=METRES", help="A slice, as z=1.2.", show_default=False),
-    out: Path = typer.Option(None, "--out", help="PNG to write. [default: beside the run]", show_default=False),
+    out: Path = typer.Option(
+        None, "--out", help="Picture to write (.png, .jpg, .svg, .pdf). [default: beside the run]", show_default=False
+    ),
     json: bool = session.JSON,
 ) -> None:
     """Numbers and a picture of one uncertainty volume."""
@@ -82,7 +84,7 @@ def inspect(
 
 
 def view(run: Path = session.RUN) -> None:
-    """Open the captured frames and the result in the Rerun viewer."""
+    """Open the captured frames, the mesh and the Gaussians in the Rerun viewer (`pip install rerun-sdk`)."""
     from active3d_pipe.errors import ConfigError
     from active3d_pipe.pipeline.stage import NodeId
 

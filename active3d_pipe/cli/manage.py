@@ -70,7 +70,7 @@ def gc(
     dry_run: bool = typer.Option(False, "--dry-run", help="Say what would go; do nothing."),
     json: bool = session.JSON,
 ) -> None:
-    """Free disk space by the policy run.keep; what is pruned is made again, to the same bytes, when it is needed."""
+    """Free disk space: run.keep says which rounds stay whole; the others are made again, to the same bytes."""
     from active3d_pipe.pipeline.gc import gc as collect
 
     runner = session.open_run(run, set_)

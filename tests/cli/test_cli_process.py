@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from stages.registry import FINISH, LOOP
 from tests.cli.conftest import ROOT, RUN
 
 DRIVE = (sys.executable, str(ROOT / "tests" / "pipeline" / "drive.py"))
@@ -75,3 +76,10 @@ def test_commands_that_only_read_pass_over_settings_of_another_version(call, run
 def test_without_a_command_the_help_is_shown_as_it_is(call, arguments: tuple) -> None:
     code, out, err = call(*arguments)
     assert (code, err) == (2, "") and out.startswith("Usage: active3d") and out.count("\n") > 5
+
+
+def test_the_help_names_every_stage(call) -> None:
+    code, out, _ = call("run-stage", "--help")
+    listed = " ".join(out.split()).partition("Arguments: stage <str> ")[2].partition(".")[0]
+    assert code == 0
+    assert listed.replace(" or ", ", ").split(", ") == [stage.name for stage in (*LOOP, *FINISH)]
