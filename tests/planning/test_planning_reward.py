@@ -178,3 +178,33 @@ def test_sight_goes_on_through_the_clear_part_of_a_voxel():
     blind = replace(field, clear=np.where(field.kind == FREE, field.clear, np.uint8(0)))
     through, stopped = (exact_terms(f, T, world.camera)[0] for f in (field, blind))
     assert through.num_visible > stopped.num_visible + 20
+
+
+def test_a_voxel_that_is_seen_free_by_halves_is_worth_a_look_and_stops_none():
+    """As with a chair's seat between rays over it and rays under it; a second look in vain halves what is expected."""
+    world = box_world.build((3.0, 2.0, 2.0), [])
+    for yaw in np.arange(0, 6.28, 0.4):
+        world.capture(se3.pose_from_yaw_pitch(np.array([0.6, 1.0, 1.0]), yaw, 0.0))
+    T = se3.pose_from_yaw_pitch(np.array([0.6, 1.0, 1.0]), 0.0, 0.0)[None]
+    volume = world.volume()
+    at = tuple(volume.grid.index_of(np.array([1.53, 1.03, 1.03])))
+    flat = np.ravel_multi_index(at, volume.grid.shape)
+    settings = PlanningSettings(credit_views=0)
+    fields = []
+    for bits, used in ((0xFF, settings), (0x55, settings), (0x55, SETTINGS)):
+        volume["cells_passed"][at] = bits
+        fields.append(build_reward_field(volume, np.repeat(T, 8, axis=0), world.camera, used))
+    whole, half, looked_at = fields
+    assert [f.kind[flat] for f in fields] == [FREE, OPEN, OPEN]
+    assert whole.value[flat] == 0 and half.value[flat] > 0 and half.through[flat] == 1 and not half.opaque[flat]
+    assert half.gain_imp[flat] == half.gain_exp[flat] == 0
+    assert 0 < looked_at.value[flat] < 0.5 * half.value[flat]
+    a, b = (exact_terms(f, T, world.camera)[0] for f in (whole, half))
+    assert b.reward - a.reward == pytest.approx(half.value[flat], rel=1e-3)
+    assert b.surface == pytest.approx(a.surface)
+    beside = (at[0], at[1], at[2] + 1)
+    for name in ("free_evidence", "hit_evidence"):
+        volume[name][beside] = 0
+    at_the_border = build_reward_field(volume, T, world.camera, settings)
+    assert at_the_border.kind[flat + 1] == OPEN and at_the_border.kind[flat] == FREE
+    assert at_the_border.value[flat] == 0 and at_the_border.value[flat + 1] > 0
