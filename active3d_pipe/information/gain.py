@@ -18,7 +18,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from active3d_pipe.information.config import SETTLED_RAYS, InformationSettings
-from active3d_pipe.structures.camera import Camera
 
 FREE, OPEN, SURFACE = 0, 1, 2
 # A voxel whose rays end in it at least this often is no free space: thin structure fills part of a voxel only.
@@ -169,31 +168,4 @@ def information_volumes(
     return InformationVolumes(
         kind, value.astype(np.float32), surface_value.astype(np.float32), arrays["view_quality"],
         reduction(arrays["entropy_imp"]), reduction(arrays["entropy_exp"]),
-    )
-
-
-def visible_information(
-    arrays: Mapping[str, np.ndarray],
-    visible: np.ndarray,
-    camera: Camera,
-    settings: InformationSettings | None = None,
-) -> GainTerms:
-    """Expected gain of a view that sees the voxels `visible` of a camera (flat ids, each once).
-
-    Surface counts as if it were then seen well enough; a caller that knows the pose scores more finely
-    (`planning.reward`).
-    """
-    settings = settings or InformationSettings()
-    enough = settings.enough_quality(camera.fx)
-    volumes = information_volumes(arrays, settings, enough)
-    kind = volumes.kind.ravel()[visible]
-    missing = np.maximum(0, 1 - volumes.quality.ravel()[visible] / enough)
-    surface = float((volumes.surface_value.ravel()[visible] * missing).sum(dtype=np.float64))
-    return GainTerms(
-        reward=float(volumes.value.ravel()[visible].sum(dtype=np.float64)) + surface,
-        surface=surface,
-        gain_imp=float(volumes.gain_imp.ravel()[visible].sum(dtype=np.float64)),
-        gain_exp=float(volumes.gain_exp.ravel()[visible].sum(dtype=np.float64)),
-        num_visible=len(visible),
-        num_open=int((kind == OPEN).sum()),
     )

@@ -10,7 +10,6 @@ from active3d_pipe.information.gain import (
     information_volumes,
     normalised_uncertainty,
     view_quality,
-    visible_information,
 )
 from active3d_pipe.structures import VOLUMES, Camera
 
@@ -64,30 +63,24 @@ def test_seen_free_space_is_worth_nothing_even_when_uncertain():
 
 def test_surface_is_worth_a_look_until_it_was_seen_well():
     s = InformationSettings()
-    rewards = []
+    gains = []
     for quality in (0.0, 0.5 * ENOUGH, ENOUGH, 1.0):
         a = volumes()
         observe(a, 0, hit=9, occupancy=0.99, quality=quality)
-        rewards.append(visible_information(a, np.array([0]), CAMERA, s).reward)
-    assert rewards[0] > 0
-    assert rewards[1] == pytest.approx(0.5 * rewards[0])
-    assert rewards[2] == rewards[3] == 0
+        seen = information_volumes(a, s, ENOUGH)
+        assert seen.surface_value[0, 0, 0] > 0 and seen.value[0, 0, 0] == 0
+        gains.append(seen.gain_imp[0, 0, 0])
+    assert gains[0] > 0
+    assert gains[1] == pytest.approx(0.5 * gains[0])
+    assert gains[2] == gains[3] == 0
 
 
 def test_expected_entropy_reduction_leaves_the_residual():
-    s = InformationSettings(residual_bits=0.25)
     a = volumes()
     a["entropy_exp"][:] = 0.1
-    terms = visible_information(a, np.array([0, 1, 2]), CAMERA, s)
-    assert terms.gain_imp == pytest.approx(3 * 0.75)
-    assert terms.gain_exp == 0
-    assert terms.gain == terms.gain_imp
-    assert (terms.num_visible, terms.num_open) == (3, 3)
-
-
-def test_no_visible_voxels_no_gain():
-    terms = visible_information(volumes(), np.array([], dtype=np.int64), CAMERA)
-    assert (terms.reward, terms.gain, terms.num_visible) == (0, 0, 0)
+    expected = information_volumes(a, InformationSettings(residual_bits=0.25), ENOUGH)
+    np.testing.assert_allclose(expected.gain_imp, 0.75)
+    np.testing.assert_array_equal(expected.gain_exp, 0)
 
 
 def test_credit_scales_everything_expected():
