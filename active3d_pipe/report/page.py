@@ -19,8 +19,8 @@ LEADS = {
     "floor_plan": "A horizontal slice of what the map holds for free, occupied and unknown, and the path over it; "
     "arrows show where the camera looked, numbers the order of the chosen views.",
     "curves": "What the run knew after so many exploration steps. Completion and distances are those of a coarse "
-    "surface of the round; the final mesh is finer. The mean uncertainty is that of all voxels observed so far, weighted as "
-    "in each round's fusion: it rises with the weights and with voxels that were hardly seen yet.",
+    "surface of the round; the final mesh is finer. The mean uncertainty is that of all voxels observed so far, "
+    "weighted as in each round's fusion: it rises with the weights and with voxels that were hardly seen yet.",
     "views": "Poses that the run never visited, from the worst render shown to the best. Grey: nothing is known there "
     "in the truth (errors) or nothing was rendered (depth).",
     "mesh": "The exported mesh. In views from outside, faces are seen from the side of the room only.",
