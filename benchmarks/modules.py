@@ -112,7 +112,7 @@ def measure_rasteriser(count: int = 200_000) -> list[list[str]]:
         image["ours"] = ours.forward(values, camera, CORNER)
 
     def our_backward() -> None:
-        image["gradient"] = ours.backward(grad)
+        image["gradient"] = ours.backward_rows(grad)[1]
 
     parts = {"our forward": our_forward, "our backward": our_backward, "forward": reference_forward,
              "backward": reference_backward}

@@ -35,13 +35,13 @@ def _rotation(w, x, y, z):
 
 
 @njit(parallel=True, fastmath=True, cache=True)
-def project(values, R, t, view, tile_size, tile_grid, chunks, dilation, compensate, rec, ids, box, counts):
-    """Write the records of the visible primitives; chunk c fills rec[N c // chunks :][: counts[c]].
+def project(values, which, R, t, view, tile_size, tile_grid, chunks, dilation, compensate, rec, ids, box, counts):
+    """Write the records of the visible ones of `which` (L,) int32; chunk c fills rec[L c // chunks :][: counts[c]].
 
     `R` (3, 3), `t` (3,) map world to camera; `view` (9,) = fx, fy, cx, cy, clamp of x/z, clamp of y/z, W, H,
-    near; `ids` index of the primitive behind every record; `box` (N, 4) int16 tile range x0, x1, y0, y1.
+    near; `ids` index of the primitive behind every record; `box` (L, 4) int16 tile range x0, x1, y0, y1.
     """
-    n = values.shape[0]
+    n = which.shape[0]
     fx, fy, cx, cy, lim_x, lim_y = view[0], view[1], view[2], view[3], view[4], view[5]
     width, height, near = view[6], view[7], view[8]
     tw, th = F(tile_size[0]), F(tile_size[1])
@@ -50,7 +50,8 @@ def project(values, R, t, view, tile_size, tile_grid, chunks, dilation, compensa
     for c in prange(chunks):
         k = n * c // chunks
         first = k
-        for i in range(n * c // chunks, n * (c + 1) // chunks):
+        for place in range(n * c // chunks, n * (c + 1) // chunks):
+            i = which[place]
             mx, my, mz = values[i, 0], values[i, 1], values[i, 2]
             z = R[2, 0] * mx + R[2, 1] * my + R[2, 2] * mz + t[2]
             if not z > near:
@@ -153,23 +154,26 @@ def may_be_seen(values, Rs, ts, views, chunks, dilation, out):
 
 
 @njit(parallel=True, fastmath=True, cache=True)
-def chain_rule(values, R, t, view, chunks, dilation, compensate, rec, ids, counts, first_entry, entry_grad, grad):
-    """Sum the entry gradients of every record and carry them to the parameters; rows of the unseen become 0.
+def chain_rule(
+    values, n, R, t, view, chunks, dilation, compensate, rec, ids, counts, first_entry, entry_grad, rows, grad
+):
+    """Sum the entry gradients of every record and carry them to the parameters.
 
+    `n`: number of primitives that were asked about (L of `project`).
     `entry_grad` (E, 12): sums over the pixels of one tile of q, q dx, q dy, q dx dx, q dx dy, q dy dy, w g_r,
     w g_g, w g_b, w g_z, with q = dL/d ln alpha; the entries of record k are first_entry[k] : first_entry[k + 1].
-    `grad` (N, 14) receives dL/dvalues. Summed in a fixed order: the same bytes for any number of threads.
+    `grad` (M, 14) receives dL/dvalues of the visible primitives `rows` (M,), ascending as in `project`. Summed in a
+    fixed order: the same bytes for any number of threads.
     """
-    n = values.shape[0]
     fx, fy, lim_x, lim_y = view[0], view[1], view[4], view[5]
     for c in prange(chunks):
-        k = n * c // chunks
-        stop = k + counts[c]
-        for i in range(n * c // chunks, n * (c + 1) // chunks):
-            if k >= stop or ids[k] != i:
-                for j in range(14):
-                    grad[i, j] = ZERO
-                continue
+        before = 0
+        for b in range(c):
+            before += counts[b]
+        start = n * c // chunks
+        for k in range(start, start + counts[c]):
+            i, out = ids[k], before + k - start
+            rows[out] = i
             g0, gx, gy, gxx, gxy = ZERO, ZERO, ZERO, ZERO, ZERO
             gyy, gr, gg, gb, gz = ZERO, ZERO, ZERO, ZERO, ZERO
             for e in range(first_entry[k], first_entry[k + 1]):
@@ -225,7 +229,7 @@ def chain_rule(values, R, t, view, chunks, dilation, compensate, rec, ids, count
                 q11 += g0 * (a0 * inv0 - kc)
             d00, d01, d02 = q00 * v00 + q01 * v10, q00 * v01 + q01 * v11, q00 * v02 + q01 * v12
             d10, d11, d12 = q01 * v00 + q11 * v10, q01 * v01 + q11 * v11, q01 * v02 + q11 * v12
-            grad[i, 3], grad[i, 4], grad[i, 5] = d00 * v00 + d10 * v10, d01 * v01 + d11 * v11, d02 * v02 + d12 * v12
+            grad[out, 3], grad[out, 4], grad[out, 5] = d00 * v00 + d10 * v10, d01 * v01 + d11 * v11, d02 * v02 + d12 * v12
             d00, d01, d02, d10, d11, d12 = d00 * s0, d01 * s1, d02 * s2, d10 * s0, d11 * s1, d12 * s2
 
             # Rotation: dRq = (J R)^T dE, then to the quaternion, without its radial part.
@@ -237,8 +241,8 @@ def chain_rule(values, R, t, view, chunks, dilation, compensate, rec, ids, count
             hy = TWO * (qx * (r01 + r10) + qz * (r12 + r21) + qw * (r02 - r20) - TWO * qy * (r00 + r22))
             hz = TWO * (qx * (r02 + r20) + qy * (r12 + r21) + qw * (r10 - r01) - TWO * qz * (r00 + r11))
             radial = hw * qw + hx * qx + hy * qy + hz * qz
-            grad[i, 6], grad[i, 7] = (hw - radial * qw) * qn, (hx - radial * qx) * qn
-            grad[i, 8], grad[i, 9] = (hy - radial * qy) * qn, (hz - radial * qz) * qn
+            grad[out, 6], grad[out, 7] = (hw - radial * qw) * qn, (hx - radial * qx) * qn
+            grad[out, 8], grad[out, 9] = (hy - radial * qy) * qn, (hz - radial * qz) * qn
 
             # Mean, in the camera frame first: through u, v, the depth channel and the Jacobian J.
             e00, e01, e02 = d00 * r[0] + d01 * r[1] + d02 * r[2], d00 * r[3] + d01 * r[4] + d02 * r[5], \
@@ -261,9 +265,8 @@ def chain_rule(values, R, t, view, chunks, dilation, compensate, rec, ids, count
                 dpz += TWO * fyz * iz * py * h12
             else:
                 dpz += fyz * iz * py * h12
-            grad[i, 0] = R[0, 0] * dpx + R[1, 0] * dpy + R[2, 0] * dpz
-            grad[i, 1] = R[0, 1] * dpx + R[1, 1] * dpy + R[2, 1] * dpz
-            grad[i, 2] = R[0, 2] * dpx + R[1, 2] * dpy + R[2, 2] * dpz
-            grad[i, 10] = g0 * (ONE - rec[k, 13])
-            grad[i, 11], grad[i, 12], grad[i, 13] = gr, gg, gb
-            k += 1
+            grad[out, 0] = R[0, 0] * dpx + R[1, 0] * dpy + R[2, 0] * dpz
+            grad[out, 1] = R[0, 1] * dpx + R[1, 1] * dpy + R[2, 1] * dpz
+            grad[out, 2] = R[0, 2] * dpx + R[1, 2] * dpy + R[2, 2] * dpz
+            grad[out, 10] = g0 * (ONE - rec[k, 13])
+            grad[out, 11], grad[out, 12], grad[out, 13] = gr, gg, gb

@@ -5,10 +5,10 @@ import torch
 from torch import Tensor
 
 from active3d_pipe.errors import ArtifactError
-from active3d_pipe.gaussians import kernels_adam
+from active3d_pipe.gaussians import kernels_adam, raster_pass
 from active3d_pipe.gaussians.config import GaussianSettings
 from active3d_pipe.gaussians.raster_pass import Workspace
-from active3d_pipe.structures import GaussianModel
+from active3d_pipe.structures import Camera, GaussianModel
 
 MEANS, LOG_SCALES, QUATS = slice(0, 3), slice(3, 6), slice(6, 10)
 OPACITY_LOGITS, COLORS = 10, slice(11, 14)
@@ -18,6 +18,9 @@ GROWTH = 0.05  # share of room that is taken for more when arrays grow
 
 class GaussianParameters:
     """N Gaussians and the state of their optimiser.
+
+    An iteration moves those that its image shows; the others owe the steps that their momentum takes (`kernels_adam`),
+    and take them when they may be seen again, or when any of the four arrays below is asked for.
 
     Attributes:
         values: (N, 14) float32, one row per primitive: mean (world, m) 0:3, log-scale 3:6, quaternion wxyz 6:10,
@@ -29,12 +32,59 @@ class GaussianParameters:
     """
 
     def __init__(self, values: Tensor, moment1: Tensor, moment2: Tensor, steps: Tensor) -> None:
-        self.values = values
-        self.moment1 = moment1
-        self.moment2 = moment2
-        self.steps = steps
+        self._arrays = (values, moment1, moment2, steps)
         self.workspace = Workspace()
         self._room: tuple[Tensor, ...] = ()
+        # Iterations so far, the one that each primitive has come to, and how Adam ran in the last.
+        self._now = 0
+        self._done = np.zeros(len(values), np.int32)
+        self._adam = (np.zeros(WIDTH, np.float32), np.float32(0), np.float32(0))
+        self._owing = False
+        self._places: np.ndarray | None = None
+
+    @property
+    def values(self) -> Tensor:
+        """See the class."""
+        return self._settled()[0]
+
+    @property
+    def moment1(self) -> Tensor:
+        """See the class."""
+        return self._settled()[1]
+
+    @property
+    def moment2(self) -> Tensor:
+        """See the class."""
+        return self._settled()[2]
+
+    @property
+    def steps(self) -> Tensor:
+        """See the class."""
+        return self._settled()[3]
+
+    def _plain(self) -> tuple[np.ndarray, ...]:
+        """The four arrays as they are, and `kernels_adam.measure` of the first."""
+        arrays = tuple(a.detach().numpy() for a in self._arrays)
+        if self._places is None:
+            self._places = np.empty((len(self), 4), np.float32)
+            kernels_adam.measure(arrays[0], self._places)
+        return *arrays, self._places
+
+    def _settled(self) -> tuple[Tensor, ...]:
+        """The four arrays, when all steps that are owed have been taken; who gets them may change them."""
+        if self._owing:
+            self._catch_up(np.arange(len(self), dtype=np.int32))
+            self._owing = False
+        self._places = None
+        return self._arrays
+
+    def _catch_up(self, rows: np.ndarray) -> None:
+        kernels_adam.catch_up(*self._plain(), self._done, self._now, rows, *self._adam)
+
+    def _replace(self, arrays: tuple[Tensor, ...]) -> None:
+        """Other arrays, none of which owes a step."""
+        self._arrays, self._owing, self._places = arrays, False, None
+        self._done = np.full(len(arrays[0]), self._now, np.int32)
 
     @classmethod
     def from_model(cls, model: GaussianModel) -> "GaussianParameters":
@@ -59,7 +109,7 @@ class GaussianParameters:
         return GaussianModel(*(v[:, c].copy() if copy else v[:, c] for c in columns))
 
     def __len__(self) -> int:
-        return len(self.values)
+        return len(self._arrays[0])
 
     @property
     def means(self) -> Tensor:
@@ -93,18 +143,18 @@ class GaussianParameters:
         n = len(self)
         room = self._reserve(n + len(model))
         room[0][n : n + len(model)] = torch.from_numpy(_pack(model))
-        self.values, self.moment1, self.moment2, self.steps = (a[: n + len(model)] for a in room)
+        self._arrays, self._places = tuple(a[: n + len(model)] for a in room), None
+        self._done = np.concatenate([self._done, np.full(len(model), self._now, np.int32)])
 
     def _reserve(self, count: int) -> tuple[Tensor, ...]:
         """Arrays for at least `count` primitives that begin with these; what lies beyond them was never written."""
         room = self._room
-        if room and len(room[0]) >= count and room[0].data_ptr() == self.values.data_ptr():
+        if room and len(room[0]) >= count and room[0].data_ptr() == self._arrays[0].data_ptr():
             return room
         size = count + int(GROWTH * count)
         room = (torch.from_numpy(np.zeros((size, WIDTH), np.float32)), *_no_moments(size))
-        held = (self.values.detach(), self.moment1, self.moment2, self.steps)
-        for new, old in zip(room, held, strict=True):
-            new[: len(self)] = old
+        for new, old in zip(room, self._arrays, strict=True):
+            new[: len(self)] = old.detach()
         self._room = room
         return room
 
@@ -113,8 +163,7 @@ class GaussianParameters:
         if mask.all():
             return
         kept = torch.from_numpy(np.flatnonzero(mask))
-        self.values = self.values.detach()[kept]
-        self.moment1, self.moment2, self.steps = self.moment1[kept], self.moment2[kept], self.steps[kept]
+        self._replace(tuple(a.detach()[kept] for a in self._settled()))
 
     def rest(self, mask: np.ndarray) -> np.ndarray:
         """Keep the primitives where `mask` (N,) bool is False; returns the values (M, 14) of the others for `wake`."""
@@ -124,13 +173,13 @@ class GaussianParameters:
 
     def wake(self, resting: np.ndarray) -> None:
         """Put primitives with these values (M, 14) in front, as if the optimiser had never run on them."""
-        held = (self.values.detach(), self.moment1, self.moment2, self.steps)
+        held = self._settled()
         m = len(resting)
         whole = (np.empty((m + len(self), WIDTH), np.float32), *(a.numpy() for a in _no_moments(m + len(self))))
         whole[0][:m] = resting
         for new, old in zip(whole, held, strict=True):
-            new[m:] = old
-        self.values, self.moment1, self.moment2, self.steps = (torch.from_numpy(a) for a in whole)
+            new[m:] = old.detach()
+        self._replace(tuple(torch.from_numpy(a) for a in whole))
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything a later `from_state` needs to go on with the same bytes; views, valid until the next step.
@@ -164,32 +213,56 @@ class GaussianParameters:
             whole[name][n - len(a) :] = a
         return cls(*(torch.from_numpy(a) for a in whole.values()))
 
+    def near(self, camera: Camera, T_world_camera: np.ndarray, dilation_px2: float) -> tuple[np.ndarray, np.ndarray]:
+        """The primitives that a view may show, after the steps that they owe.
+
+        Returns:
+            values (N, 14) float32, of which only the rows that follow are up to date; a view.
+            rows (L,) int32, ascending, a superset of those that the view shows.
+        """
+        n, chunks = len(self), raster_pass.CHUNKS
+        which, counts = self.workspace.get("may_be_seen", (n,), np.int32), np.zeros(chunks, np.int64)
+        kernels_adam.near(
+            *self._plain(), self._done, self._now, *self._adam, *raster_pass.view_arrays(camera, T_world_camera),
+            np.float32(dilation_px2), chunks, which, counts,
+        )
+        parts = [which[n * c // chunks :][:count] for c, count in enumerate(counts.tolist())]
+        return self._plain()[0], np.concatenate(parts)
+
+    def rows(self, rows: np.ndarray) -> np.ndarray:
+        """(M, 14) float32 copy of the values of primitives (M,), after the steps that they owe."""
+        self._catch_up(rows)
+        return self._plain()[0][rows]
+
     def step(
-        self,
-        grads: np.ndarray | Tensor,
-        settings: GaussianSettings,
-        learning_rate_scale: float = 1.0,
-        visible: np.ndarray | None = None,
+        self, grads: np.ndarray | Tensor, settings: GaussianSettings, learning_rate_scale: float = 1.0,
+        rows: np.ndarray | None = None,
     ) -> None:
-        """One Adam step with dL/dvalues `grads` (N, 14) float32.
+        """One Adam step with dL/dvalues `grads`.
 
         Args:
-            grads: gradient of the loss.
-            settings: learning rates and decays.
+            grads: (M, 14) float32 gradient of the loss, at the primitives `rows`.
+            settings: learning rates and decays; with `visible_only` the others stay as they are for good.
             learning_rate_scale: factor on all learning rates (annealing).
-            visible: (N,) bool; with `settings.visible_only`, primitives outside it stay as they are.
+            rows: (M,) int32, different primitives that `near` or `rows` gave out since the last step; default all.
+                The gradient of the others is zero.
         """
         grad = grads.numpy() if isinstance(grads, Tensor) else grads
+        if rows is None:
+            self._settled()
+            rows = np.arange(len(self), dtype=np.int32)
         rates = np.empty(WIDTH, np.float32)
         rates[MEANS], rates[LOG_SCALES], rates[QUATS] = settings.lr_means_m, settings.lr_log_scales, settings.lr_quats
         rates[OPACITY_LOGITS], rates[COLORS] = settings.lr_opacity_logits, settings.lr_colors
-        selective = settings.visible_only and visible is not None
-        kernels_adam.adam(
-            self.values.detach().numpy(), self.moment1.numpy(), self.moment2.numpy(), self.steps.numpy(),
-            np.ascontiguousarray(grad, dtype=np.float32), rates * np.float32(learning_rate_scale),
-            np.float32(settings.adam_beta1), np.float32(settings.adam_beta2),
-            selective, visible if selective else np.zeros(0, bool),  # type: ignore[arg-type]
+        self._adam = (
+            rates * np.float32(learning_rate_scale), np.float32(settings.adam_beta1), np.float32(settings.adam_beta2)
         )
+        kernels_adam.adam(*self._plain(), rows, np.ascontiguousarray(grad, dtype=np.float32), *self._adam)
+        if settings.visible_only:
+            return
+        self._now += 1
+        self._done[rows] = self._now
+        self._owing |= len(rows) < len(self)
 
 
 def _no_moments(n: int) -> tuple[Tensor, Tensor, Tensor]:

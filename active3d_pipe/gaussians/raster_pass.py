@@ -59,15 +59,18 @@ class RasterPass:
 
     def forward(
         self, values: np.ndarray, camera: Camera, T_world_camera: np.ndarray, tiles: np.ndarray | None = None,
-        seen: np.ndarray | None = None,
+        seen: np.ndarray | None = None, which: np.ndarray | None = None,
     ) -> np.ndarray:
         """Render `values` (N, 14) float32 (see kernels_projection); returns (5, H, W) r, g, b, sum w z, alpha.
 
         `tiles`: ids (row-major, `tile_grid`) of the tiles to draw, default all; pixels elsewhere are 0.
         `seen`: observed depth (H, W) float32, m; with it a sixth plane is sum w min(|z - seen|, SIGHT_LIMIT_M), how far
         what is drawn lies from there along the line of sight.
+        `which`: (L,) int32, ascending, the primitives that may be visible; default all.
         """
-        n, get = len(values), self.workspace.get
+        get = self.workspace.get
+        which = np.arange(len(values), dtype=np.int32) if which is None else which
+        n = len(which)
         grid = tile_grid(camera)
         tile_ids = np.arange(grid[0] * grid[1], dtype=np.int32) if tiles is None else np.asarray(tiles, np.int32)
         tile_slot = get("tile_slot", (grid[0] * grid[1],), np.int32)
@@ -79,7 +82,7 @@ class RasterPass:
         ids, box = get("ids", (n,), np.int32), get("box", (n, 4), np.int16)
         counts = get("counts", (CHUNKS,), np.int64)
         kernels_projection.project(
-            values, R, t, view, TILE_SIZE, grid, CHUNKS, np.float32(self.dilation_px2), self.compensate,
+            values, which, R, t, view, TILE_SIZE, grid, CHUNKS, np.float32(self.dilation_px2), self.compensate,
             rec, ids, box, counts,
         )
         order = get("order", (n,), np.int32)
@@ -107,7 +110,7 @@ class RasterPass:
             rec, entries, tile_start, tile_ids, bounds, grid[0], np.float32(self.t_stop), observed, out, used
         )
         self._state = {
-            "values": values, "R": R, "t": t, "view": view, "rec": rec, "ids": ids, "counts": counts,
+            "values": values, "asked": n, "R": R, "t": t, "view": view, "rec": rec, "ids": ids, "counts": counts,
             "first_entry": first_entry, "entries": entries, "tile_start": tile_start, "tile_ids": tile_ids,
             "bounds": bounds, "tiles_x": grid[0], "used": used, "seen": observed, "out": out, "visible": m,
         }
@@ -115,19 +118,28 @@ class RasterPass:
 
     def backward(self, out_grad: np.ndarray) -> np.ndarray:
         """dL/dvalues (N, 14) float32 from dL/dout of the last `forward`, as many planes as it gave."""
-        s = self._state
-        n = len(s["values"])
-        entry_grad = self.workspace.get("entry_grad", (len(s["entries"]), 12), np.float32)
+        rows, found = self.backward_rows(out_grad)
+        grad = np.zeros((len(self._state["values"]), 14), np.float32)
+        grad[rows] = found
+        return grad
+
+    def backward_rows(self, out_grad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The same for the visible primitives alone: their indices (M,) int32, ascending, and (M, 14) float32.
+
+        What it returns lives in the workspace.
+        """
+        s, get = self._state, self.workspace.get
+        entry_grad = get("entry_grad", (len(s["entries"]), 12), np.float32)
         kernels_tiles.backward(
             s["rec"], s["entries"], s["tile_start"], s["tile_ids"], s["bounds"], s["tiles_x"], s["used"], s["seen"],
             s["out"], out_grad, entry_grad,
         )
-        grad = self.workspace.get("grad", (n, 14), np.float32)
+        rows, grad = get("rows", (s["visible"],), np.int32), get("grad", (s["visible"], 14), np.float32)
         kernels_projection.chain_rule(
-            s["values"], s["R"], s["t"], s["view"], CHUNKS, np.float32(self.dilation_px2), self.compensate,
-            s["rec"], s["ids"], s["counts"], s["first_entry"], entry_grad, grad,
+            s["values"], s["asked"], s["R"], s["t"], s["view"], CHUNKS, np.float32(self.dilation_px2), self.compensate,
+            s["rec"], s["ids"], s["counts"], s["first_entry"], entry_grad, rows, grad,
         )
-        return grad
+        return rows, grad
 
     @property
     def num_visible(self) -> int:
@@ -136,10 +148,10 @@ class RasterPass:
 
     def visible(self) -> np.ndarray:
         """(N,) bool, primitives that the last `forward` projected onto a drawn image."""
-        s, n = self._state, len(self._state["values"])
-        mask = np.zeros(n, bool)
+        s = self._state
+        mask = np.zeros(len(s["values"]), bool)
         for c in range(CHUNKS):
-            start = n * c // CHUNKS
+            start = s["asked"] * c // CHUNKS
             mask[s["ids"][start : start + s["counts"][c]]] = True
         return mask
 

@@ -94,7 +94,9 @@ def render_view(
     """The view as NumPy arrays, without gradients; see `RenderedView`."""
     params = model if isinstance(model, GaussianParameters) else GaussianParameters.from_model(model)
     T = check_pose(T_world_camera, "render_view: T_world_camera")
-    image = new_pass(settings or GaussianSettings()).forward(params.values.detach().numpy(), camera, T)
+    raster = new_pass(settings or GaussianSettings())
+    values, may_be_seen = params.near(camera, T, raster.dilation_px2)
+    image = raster.forward(values, camera, T, which=may_be_seen)
     alpha = image[4].copy()
     depth = np.where(alpha >= 0.5, image[3] / np.maximum(alpha, 1e-6), 0).astype(np.float32)
     return RenderedView(np.ascontiguousarray(image[:3].transpose(1, 2, 0)), depth, alpha)

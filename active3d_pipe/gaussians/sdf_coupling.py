@@ -4,12 +4,12 @@ import numpy as np
 
 from active3d_pipe.errors import InputError
 from active3d_pipe.gaussians.config import GaussianSettings
-from active3d_pipe.gaussians.parameters import LOG_SCALES, MEANS, QUATS, WIDTH, GaussianParameters
+from active3d_pipe.gaussians.parameters import LOG_SCALES, MEANS, QUATS, WIDTH
 from active3d_pipe.geometry import se3
 
 
 def sdf_gradient(
-    params: GaussianParameters, sdf: np.ndarray, sdf_grad: np.ndarray, settings: GaussianSettings
+    values: np.ndarray, sdf: np.ndarray, sdf_grad: np.ndarray, settings: GaussianSettings
 ) -> tuple[dict[str, float], np.ndarray]:
     """Energy that pulls means to the zero level and shortest axes to the field's gradient.
 
@@ -17,15 +17,15 @@ def sdf_gradient(
     n_i the unit gradient of the field; coupled are the means with |SDF| below `sdf_band_m` and a gradient.
 
     Args:
-        params: the model.
+        values: (N, 14) float32 of the primitives that take part (`GaussianParameters`).
         sdf: (N,) field at the means, m. NaN where the field is not trusted: such means are not coupled.
         sdf_grad: (N, 3) its gradient with respect to the world position.
         settings: w = `sdf_weight`, v = `sdf_normal_weight`, `sdf_band_m`.
 
     Returns:
-        {energy, sdf_l1 (m), normal, coupled} and dE/dvalues (N, 14) float32, for `optimise_step(extra_gradient=)`.
+        {energy, sdf_l1 (m), normal, coupled} and dE/dvalues (N, 14) float32.
     """
-    n = len(params)
+    n = len(values)
     if sdf.shape != (n,) or sdf_grad.shape != (n, 3):
         raise InputError(f"sdf coupling: sdf {sdf.shape}, gradient {sdf_grad.shape}, expected {(n,)} and {(n, 3)}")
     gradient = np.zeros((n, WIDTH), np.float32)
@@ -34,7 +34,6 @@ def sdf_gradient(
         i = np.flatnonzero((np.abs(sdf) < settings.sdf_band_m) & (length > 1e-6))
     if len(i) == 0:
         return {"energy": 0.0, "sdf_l1": 0.0, "normal": 0.0, "coupled": 0.0}, gradient
-    values = params.values.detach().numpy()
     normals = sdf_grad[i] / length[i, None]
     quats = values[i, QUATS].astype(np.float64)
     shortest = values[i, LOG_SCALES].argmin(axis=1)

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from active3d_pipe.information import kernels
 from active3d_pipe.information.config import SETTLED_RAYS, InformationSettings
 
 FREE, OPEN, SURFACE = 0, 1, 2
@@ -73,10 +74,9 @@ class InformationVolumes:
 def classify(arrays: Mapping[str, np.ndarray], settings: InformationSettings) -> np.ndarray:
     """uint8 kind of every voxel from occupancy and ray evidence (see the module's first lines)."""
     free, hit, occupancy = arrays["free_evidence"], arrays["hit_evidence"], arrays["occupancy"]
-    rays = free + hit
-    surface = (hit > 0) & ((occupancy > 0.5) | (hit >= np.maximum(2, THIN_HIT_SHARE * rays)))
-    seen_free = ~surface & (free >= settings.settled_rays)
-    return np.where(surface, SURFACE, np.where(seen_free, FREE, OPEN)).astype(np.uint8)
+    out = np.empty(free.shape, np.uint8)
+    kernels.classify(free, hit, occupancy, np.float32(settings.settled_rays), np.float32(THIN_HIT_SHARE), out)
+    return out
 
 
 def entropy_drop(
@@ -97,23 +97,28 @@ def entropy_drop(
     return imp, exp
 
 
-def normalised_uncertainty(u_final: np.ndarray, observed: np.ndarray) -> np.ndarray:
-    """U(v) in units of its typical value where nothing was observed, clipped to [0, 2], float32.
+def uncertainty_level(u_final: np.ndarray, observed: np.ndarray) -> float:
+    """The unit of U(v): its typical value where nothing was observed; 0 when it is nothing anywhere.
 
     The scale of the fused uncertainty follows from the regression that fits it and drifts over a run; weights and
     thresholds of the planner need one that stays. Without the field's term unseen space has no uncertainty of its own:
     then the scale is what one in twenty observed voxels that have any exceeds.
     """
-    u = np.maximum(u_final, 0)
-    unseen = u[~observed]
+    unseen = np.maximum(u_final[~observed], 0)
     if unseen.size and np.count_nonzero(unseen <= LEAST_LEVEL) <= 0.1 * unseen.size:
         level = float(np.median(unseen))
     else:
-        some = u[observed & (u > LEAST_LEVEL)]
-        level = float(np.quantile(some, 0.95)) if some.size else float(u.max(initial=0.0))
-    if level <= LEAST_LEVEL:
-        return np.zeros_like(u, dtype=np.float32)
-    return np.clip(u / np.float32(level), 0, 2).astype(np.float32)
+        some = u_final[observed & (u_final > LEAST_LEVEL)]
+        level = float(np.quantile(some, 0.95)) if some.size else float(u_final.max(initial=0.0))
+    return level if level > LEAST_LEVEL else 0.0
+
+
+def normalised_uncertainty(u_final: np.ndarray, observed: np.ndarray) -> np.ndarray:
+    """U(v) in units of `uncertainty_level`, clipped to [0, 2], float32."""
+    level = uncertainty_level(u_final, observed)
+    if level == 0:
+        return np.zeros_like(u_final, dtype=np.float32)
+    return np.clip(u_final / np.float32(level), 0, 2).astype(np.float32)
 
 
 def hybrid_weight(u: np.ndarray, entropy: np.ndarray, settings: InformationSettings) -> np.ndarray:
@@ -150,22 +155,15 @@ def information_volumes(
     """
     if kind is None:
         kind = classify(arrays, settings)
-    rays = arrays["free_evidence"] + arrays["hit_evidence"]
-    u = normalised_uncertainty(arrays["u_final"], rays > 0)
-    weight = hybrid_weight(u, arrays["entropy"], settings)
-    novelty = np.where(kind == OPEN, np.maximum(0, 1 - rays / np.float32(settings.settled_rays)), 0)
-    # What a better look still brings to a surface, as a fraction of the whole improvement.
-    rest = np.maximum(0, 1 - arrays["view_quality"] / np.float32(enough_quality))
-    rest = np.where(kind == SURFACE, rest, 0)
-    trust = np.float32(1) if credit is None else credit.astype(np.float32)
-    value = weight * (1 - arrays["occupancy"]) * novelty * trust
-    surface_value = (settings.alpha * u + settings.beta) * (kind == SURFACE) * settings.surface_weight * trust
-    fraction = (novelty + rest) * trust
-
-    def reduction(entropy: np.ndarray) -> np.ndarray:
-        return (np.maximum(0, entropy - settings.residual_bits) * fraction).astype(np.float32)
-
-    return InformationVolumes(
-        kind, value.astype(np.float32), surface_value.astype(np.float32), arrays["view_quality"],
-        reduction(arrays["entropy_imp"]), reduction(arrays["entropy_exp"]),
+    free, hit, u = arrays["free_evidence"], arrays["hit_evidence"], arrays["u_final"]
+    trust = np.ones(kind.shape, np.float32) if credit is None else credit.astype(np.float32)
+    level = uncertainty_level(u, (free > 0) | (hit > 0))
+    filled = tuple(np.zeros(kind.shape, np.float32) for _ in range(4))
+    weights = (level, settings.alpha, settings.beta, settings.surface_weight, settings.residual_bits)
+    kernels.information(
+        kind, free, hit, arrays["occupancy"], u, arrays["entropy"], arrays["entropy_imp"], arrays["entropy_exp"],
+        arrays["view_quality"], trust, *(np.float32(w) for w in weights), np.float32(settings.settled_rays),
+        np.float32(enough_quality), *filled,
     )
+    value, surface_value, gain_imp, gain_exp = filled
+    return InformationVolumes(kind, value, surface_value, arrays["view_quality"], gain_imp, gain_exp)

@@ -15,7 +15,8 @@ from active3d_pipe.field.rays import sample_rays
 from active3d_pipe.field.sdf_field import SdfField
 from active3d_pipe.field.tsdf import TsdfField
 from active3d_pipe.gaussians.config import GaussianSettings
-from active3d_pipe.gaussians.optimisation import optimise_step
+from active3d_pipe.gaussians.optimisation import RowGradient, optimise_step
+from active3d_pipe.gaussians.parameters import MEANS
 from active3d_pipe.gaussians.pruning import prune_mask
 from active3d_pipe.gaussians.sdf_coupling import sdf_gradient
 from active3d_pipe.gaussians.seeding import error_driven, seed_frame
@@ -77,7 +78,7 @@ def seed(hybrid: HybridMap, frame: Frame, rng: np.random.Generator, clock: Clock
 
 
 def train_gaussians(
-    hybrid: HybridMap, seen: Target, rate: float, clock: Clock, coupling: np.ndarray | None = None,
+    hybrid: HybridMap, seen: Target, rate: float, clock: Clock, coupling: RowGradient | None = None,
     settings: GaussianSettings | None = None,
 ) -> dict[str, float]:
     """One iteration of E_photo and depth on one image; `coupling` is the gradient of E_geo, see `coupling_gradient`.
@@ -118,21 +119,18 @@ def fuse(hybrid: HybridMap, frames: Sequence[Frame], clock: Clock) -> None:
         hybrid.field.integrate(frames)
 
 
-def coupling_gradient(hybrid: HybridMap, rng: np.random.Generator, clock: Clock) -> np.ndarray:
-    """(N, 14) gradient of E_geo: means onto the SDF's zero level, shortest axes along its gradient.
+def coupling_gradient(hybrid: HybridMap, rng: np.random.Generator, clock: Clock) -> RowGradient:
+    """Gradient of E_geo: means onto the SDF's zero level, shortest axes along its gradient.
 
     A random share of the primitives takes part at a time, since the field is queried five times for each.
     """
     count = len(hybrid.gaussians)
     with clock.of("coupling"):
-        chosen = np.sort(rng.choice(count, size=min(count, COUPLED), replace=False))
-        means = hybrid.gaussians.means.detach().numpy()[chosen]
+        chosen = np.sort(rng.choice(count, size=min(count, COUPLED), replace=False)).astype(np.int32)
+        values = hybrid.gaussians.rows(chosen)
+        means = np.ascontiguousarray(values[:, MEANS])
         sdf, normals = hybrid.field.query_sdf(means), hybrid.field.normals(means)
-        # NaN: the others take no part this time.
-        all_sdf = np.full(count, np.nan, np.float32)
-        all_normals = np.zeros((count, 3), np.float32)
-        all_sdf[chosen], all_normals[chosen] = sdf, normals
-        return sdf_gradient(hybrid.gaussians, all_sdf, all_normals, hybrid.settings.gaussians)[1]
+        return RowGradient(chosen, sdf_gradient(values, sdf, normals, hybrid.settings.gaussians)[1])
 
 
 def add_where_wrong(

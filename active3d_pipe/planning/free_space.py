@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from active3d_pipe.planning import kernels_distance as kernels
+from active3d_pipe.planning import kernels_volumes
 from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.risk_field import RiskField, build_risk_field, joint_occupancy
 from active3d_pipe.structures.motion import MotionSettings
@@ -16,8 +17,6 @@ from active3d_pipe.structures.voxel_grid import VoxelGrid
 UNREACHABLE = 1e29
 # What an agent in a tight spot keeps at least, m.
 LEAST_ESCAPE_M = 1e-3
-# Bits of the half-size cells (4 a + 2 b + c) in the lower and the upper half of a voxel, along x, y, z.
-HALVES = ((0x0F, 0xF0), (0x33, 0xCC), (0x55, 0xAA))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,29 +95,30 @@ def known_free(
 ) -> np.ndarray:
     """(X, Y, Z) bool, voxels known to be free: rays passed them, none of weight ended in them, O is low.
 
-    Beside what is not free both halves of a voxel must have been passed (`drop_half_seen`). The agent's body is a
+    Beside what is not free both halves of a voxel must have been passed (`without_half_seen`). The agent's body is a
     sensor too: a sphere around every pose it stood at is free.
     """
-    free, hit = volume["free_evidence"], volume["hit_evidence"]
-    out = (free >= settings.min_free_rays) & (occupancy <= settings.max_free_occupancy) & (hit < 2 + 0.02 * free)
-    drop_half_seen(out, volume["cells_passed"].astype(np.uint8))
+    by_rays = np.empty(volume.grid.shape, bool)
+    kernels_volumes.free_by_rays(
+        volume["free_evidence"], volume["hit_evidence"], occupancy, np.float32(settings.min_free_rays),
+        np.float32(settings.max_free_occupancy), by_rays,
+    )
+    out = without_half_seen(by_rays, volume["cells_passed"])
     mark_body(out, volume.grid, walked, radius_m)
     return out
 
 
-def drop_half_seen(free: np.ndarray, passed: np.ndarray) -> None:
-    """Take from `free` the voxels whose half towards a neighbour that is not free was passed by no ray, in place.
+def without_half_seen(free: np.ndarray, passed: np.ndarray) -> np.ndarray:
+    """`free` without the voxels whose half towards a neighbour that is not free was passed by no ray.
 
     Rays along a wall pass the near half of its voxels and may end in none: such a voxel seems free with a wall in its
-    middle. `passed`: uint8 bits of the half-size cells [X, Y, Z]; a volume without any is left alone.
+    middle. `passed`: float32 bits of the half-size cells [X, Y, Z]; a volume without any is left alone.
     """
     if not passed.any():
-        return
-    blocked = ~free
-    for axis, (lower, upper) in enumerate(HALVES):
-        kept, beside, cells = (np.moveaxis(a, axis, 0) for a in (free, blocked, passed))
-        kept[1:] &= ~(beside[:-1] & (cells[1:] & lower == 0))
-        kept[:-1] &= ~(beside[1:] & (cells[:-1] & upper == 0))
+        return free
+    out = np.empty_like(free)
+    kernels_volumes.drop_half_seen(free, passed, out)
+    return out
 
 
 def mark_body(free: np.ndarray, grid: VoxelGrid, centres_world: np.ndarray, radius_m: float) -> None:

@@ -11,12 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from active3d_pipe.geometry.voxel_traversal import fan_stride, ray_fan
-from active3d_pipe.information.gain import FREE, OPEN, SURFACE, GainTerms, classify, information_volumes
-from active3d_pipe.planning import kernels_distance, kernels_sight
+from active3d_pipe.information.gain import SURFACE, GainTerms, classify, information_volumes
+from active3d_pipe.planning import kernels_distance, kernels_sight, kernels_volumes
 from active3d_pipe.planning import kernels_reward as kernels
 from active3d_pipe.planning.candidates import Directions
 from active3d_pipe.planning.config import PlanningSettings
-from active3d_pipe.planning.free_space import HALVES
 from active3d_pipe.structures.camera import Camera
 from active3d_pipe.structures.uncertainty_volume import UncertaintyVolume
 from active3d_pipe.structures.voxel_grid import VoxelGrid
@@ -76,27 +75,36 @@ def build_reward_field(
     enough = information.enough_quality(camera.fx)
     reach = min(settings.max_range_m, camera.far)
     kind = classify(volume.arrays, information)
-    half_seen = _half_seen(volume, kind)
-    through = _transmittance(volume, kind, settings)
-    normal = np.zeros((*grid.shape, 3), np.int8)
+    hit, passed, ended = volume["hit_evidence"], volume["cells_passed"], volume["cells_hit"]
+    half_seen, clear, unmet, of_interest, opaque, open_bits = (np.zeros(grid.shape, np.uint8) for _ in range(6))
+    through, normal = np.empty(grid.shape, np.float32), np.zeros((*grid.shape, 3), np.int8)
+    passes = np.float32(np.exp(-grid.voxel_size / settings.unknown_free_path_m))
+    kernels_volumes.sight(kind, hit, volume["occupancy"], passed, ended, passes, through, clear, unmet)
     kernels_sight.surface_normals(kind, normal)
-    clear, open_bits = _cells(volume, kind)
-    kind[half_seen] = OPEN  # To be looked at; sight goes on through them, as far as it is known.
-    of_interest = ((kind != FREE) | (volume["hit_evidence"] > 0)).view(np.uint8)
+    # A voxel is larger than what is in it: the underside of a table, the edge of a frame, the gap behind a sofa lie in
+    # voxels that count as surface seen, from the other side. A volume without cells has no open ones, and its surface
+    # stops sight everywhere.
+    if ended.any():
+        kernels_sight.open_cells(kind, clear, unmet, open_bits)
+    # Rays over and under a chair's seat meet in one voxel, and the seat may lie between them: it is to be looked at,
+    # and sight goes on through it, as far as it is known. Where an open voxel is beside, that one draws the looks: at
+    # the border of what was seen most voxels are seen by halves.
+    kernels_volumes.half_seen(kind, passed, half_seen)
+    kernels_volumes.open_half_seen(half_seen, hit, kind, of_interest, opaque)
     skip = kernels_distance.distance_transform(of_interest, LONGEST_SKIP, True).astype(np.uint8).ravel()
-    opaque = (kind == SURFACE).view(np.uint8).ravel()
     quality = np.ascontiguousarray(volume["view_quality"]).ravel()
-    cells = clear.ravel(), open_bits.ravel()
+    opaque, cells = opaque.ravel(), (clear.ravel(), open_bits.ravel())
     looks = _looks(volume, (skip, kind.ravel(), quality, normal.reshape(-1, 3)), cells, walked_poses, camera, settings)
-    credit, cell_credit = np.float32(settings.credit_factor) ** looks
+    credit, cell_credit = (kernels_volumes.powers(np.float32(settings.credit_factor), n) for n in looks)
     # An eighth of what an open voxel is worth that may turn out either way, times the weight.
     whole = settings.cell_weight * (information.alpha + information.beta) / 16
     volumes = information_volumes(volume.arrays, information, enough, credit.reshape(grid.shape), kind)
     # Four of its cells are open; that most are empty all the same is learnt by looks in vain.
-    volumes.value[half_seen] = 4 * np.float32(whole) * credit.reshape(grid.shape)[half_seen]
+    at = half_seen.view(bool)
+    volumes.value[at] = 4 * np.float32(whole) * credit.reshape(grid.shape)[at]
     return RewardField(
         grid, information.quality_range_m(camera.fx), enough, reach, kind.ravel(), opaque, skip,
-        volumes.value.ravel(), through, volumes.surface_value.ravel(), quality, normal.reshape(-1, 3),
+        volumes.value.ravel(), through.ravel(), volumes.surface_value.ravel(), quality, normal.reshape(-1, 3),
         *cells, np.float32(whole) * cell_credit,
         volumes.gain_imp.ravel(), volumes.gain_exp.ravel(),
     )
@@ -106,46 +114,6 @@ def _in_voxels(grid: VoxelGrid, poses: np.ndarray) -> tuple[np.ndarray, np.ndarr
     """Origins (N, 3) in voxel units and rotations (N, 3, 3) of poses (N, 4, 4), as the kernels take them."""
     origins = np.ascontiguousarray((poses[:, :3, 3] - grid.origin) / grid.voxel_size, dtype=np.float32)
     return origins, np.ascontiguousarray(poses[:, :3, :3], dtype=np.float32)
-
-
-def _cells(volume: UncertaintyVolume, kind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Clear and open half-size cells of every voxel, uint8 bits [X, Y, Z] (`kernels_sight`).
-
-    A voxel is larger than what is in it: the underside of a table, the edge of a frame, the gap behind a sofa lie in
-    voxels that count as surface seen, from the other side. A volume without cells has no open ones, and its surface
-    stops sight everywhere.
-    """
-    passed, ended = (volume[name].astype(np.uint8) for name in ("cells_passed", "cells_hit"))
-    clear = np.where((kind == FREE) & (volume["hit_evidence"] == 0), np.uint8(255), passed & ~ended)
-    found = np.zeros(kind.shape, np.uint8)
-    if ended.any():
-        kernels_sight.open_cells(kind, clear, ~(passed | ended), found)
-    return clear, found
-
-
-def _half_seen(volume: UncertaintyVolume, kind: np.ndarray) -> np.ndarray:
-    """(X, Y, Z) bool, voxels that count as seen free though some half of them was passed by no ray.
-
-    Rays over and under a chair's seat meet in one voxel, and the seat may lie between them. Where an open voxel is
-    beside, that one draws the looks: at the border of what was seen most voxels are seen by halves.
-    """
-    passed = volume["cells_passed"].astype(np.uint8)
-    unmet = np.zeros(kind.shape, bool)
-    for half in (mask for halves in HALVES for mask in halves):
-        unmet |= passed & np.uint8(half) == 0
-    out = unmet & (kind == FREE) & (passed > 0)
-    for axis in range(3):
-        kept, beside = np.moveaxis(out, axis, 0), np.moveaxis(kind, axis, 0) == OPEN
-        kept[1:] &= ~beside[:-1]
-        kept[:-1] &= ~beside[1:]
-    return out
-
-
-def _transmittance(volume: UncertaintyVolume, kind: np.ndarray, settings: PlanningSettings) -> np.ndarray:
-    """Share of rays that an open voxel lets pass; less where the field believes in something solid. Flat."""
-    passes = np.exp(-volume.grid.voxel_size / settings.unknown_free_path_m)
-    solid = np.clip(2 - 2 * volume["occupancy"], 0, 1)
-    return np.where(kind == OPEN, passes * solid, np.where(kind == FREE, 1, 0)).astype(np.float32).ravel()
 
 
 def spread_poses(poses: np.ndarray, count: int) -> np.ndarray:

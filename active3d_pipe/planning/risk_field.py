@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from active3d_pipe.planning import kernels_volumes as kernels
 from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.structures.voxel_grid import VoxelGrid
 
@@ -18,12 +19,12 @@ def joint_occupancy(arrays: Mapping[str, np.ndarray], settings: PlanningSettings
 
     p = c O + (1 - c) P(SDF < 0) with c = n / (n + sdf_trust_rays) for n rays that met the voxel.
     """
-    rays = arrays["free_evidence"] + arrays["hit_evidence"]
-    trust = rays / (rays + np.float32(settings.sdf_trust_rays))
-    x = np.clip(arrays["sdf"] / np.float32(settings.sdf_softness_m), -30, 30)
-    p_imp = 1 / (1 + np.exp(x))
-    joint = trust * arrays["occupancy"] + (1 - trust) * p_imp
-    return np.where(rays > 0, joint, np.float32(1)).astype(np.float32)
+    free, hit, occupancy, sdf = (arrays[name] for name in ("free_evidence", "hit_evidence", "occupancy", "sdf"))
+    out = np.empty(free.shape, np.float32)
+    kernels.joint_occupancy(
+        free, hit, occupancy, sdf, np.float32(settings.sdf_trust_rays), np.float32(settings.sdf_softness_m), out
+    )
+    return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,8 +58,8 @@ def build_risk_field(
 ) -> RiskField:
     """Risk from clearance: a smooth step between the agent's radius and the preferred clearance."""
     width = max(preferred_m - radius_m, 1e-3)
-    s = np.clip((preferred_m - clearance_m) / width, 0, 1)
-    risk = (s * s * (3 - 2 * s)).astype(np.float32)
+    risk = np.empty(clearance_m.shape, np.float32)
+    kernels.risk(clearance_m, np.float32(preferred_m), np.float32(width), risk)
     return RiskField(grid, occupancy, clearance_m, risk)
 
 

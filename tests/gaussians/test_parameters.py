@@ -8,7 +8,7 @@ from active3d_pipe.errors import ArtifactError
 from active3d_pipe.gaussians import kernels_adam
 from active3d_pipe.gaussians.config import GaussianSettings
 from active3d_pipe.gaussians.losses import frame_loss
-from active3d_pipe.gaussians.optimisation import optimise_step
+from active3d_pipe.gaussians.optimisation import RowGradient, optimise_step
 from active3d_pipe.gaussians.parameters import GaussianParameters
 from active3d_pipe.gaussians.rasteriser import render, render_view
 from active3d_pipe.structures import Camera, GaussianModel
@@ -78,10 +78,65 @@ def test_visible_only_leaves_the_others_alone() -> None:
     params = GaussianParameters.from_model(wall(20))
     before = params.values.numpy().copy()
     visible = np.arange(20) % 3 == 0
-    grad = np.ones((20, 14), np.float32)
-    params.step(grad, GaussianSettings(visible_only=True), visible=visible)
+    settings = GaussianSettings(visible_only=True)
+    for _ in range(2):
+        params.step(np.ones((7, 14), np.float32), settings, rows=np.flatnonzero(visible).astype(np.int32))
     changed = (params.values.numpy() != before).any(1)
-    assert np.array_equal(changed, visible) and np.array_equal(params.steps.numpy() == 1, visible)
+    assert np.array_equal(changed, visible) and np.array_equal(params.steps.numpy() == 2, visible)
+
+
+@pytest.mark.parametrize("already", [0, 3, 30, 400])
+@pytest.mark.parametrize("share", [0.05, 0.5])
+def test_steps_that_are_owed_come_to_those_taken_one_by_one(already: int, share: float) -> None:
+    """Against an optimiser that moves every primitive in every iteration, the gradient of the unseen being zero."""
+    settings, rng = GaussianSettings(), np.random.default_rng(already)
+    lazy, diligent = GaussianParameters.from_model(wall(400)), GaussianParameters.from_model(wall(400))
+    pull = rng.normal(size=(400, 14)).astype(np.float32)
+
+    def gradient() -> np.ndarray:
+        return ((pull + rng.normal(size=(400, 14))) * 1e-4).astype(np.float32)
+
+    for _ in range(already):
+        grad = gradient()
+        for params in (lazy, diligent):
+            params.step(grad, settings)
+    start = diligent.values.numpy().copy()
+    for i in range(60):
+        grad, shown = gradient(), rng.random(400) < share
+        rows = np.flatnonzero(shown).astype(np.int32)
+        lazy.rows(rows)
+        lazy.step(grad[rows], settings, rows=rows)
+        diligent.step(np.where(shown[:, None], grad, 0).astype(np.float32), settings)
+        if i == 30:
+            for params in (lazy, diligent):
+                params.append(wall(7, 3))
+                params.keep(np.arange(407) < 400)
+    way = np.abs(diligent.values.numpy() - start)
+    assert np.array_equal(lazy.steps.numpy(), diligent.steps.numpy())
+    apart = np.abs(lazy.values.numpy() - diligent.values.numpy())
+    assert apart.sum() < 0.03 * way.sum() and way.sum() > 1
+    np.testing.assert_allclose(lazy.moment2.numpy(), diligent.moment2.numpy(), rtol=1e-3, atol=1e-12)
+    np.testing.assert_allclose(lazy.moment1.numpy(), diligent.moment1.numpy(), rtol=1e-3, atol=1e-9)
+
+
+def test_a_view_moves_what_it_shows_and_the_rest_goes_on() -> None:
+    camera, settings = Camera.from_fov(60, 44, 60), GaussianSettings()
+    rgb, depth = target(camera)
+    behind = wall(50, 3)
+    behind.means[:, 2] = -2
+    params = GaussianParameters.from_model(wall(300))
+    params.append(behind)
+    params.step(np.full((350, 14), 1e-4, np.float32), settings)
+    before = params.values.numpy().copy()
+    _, near = params.near(camera, np.eye(4), settings.dilation_px2)
+    assert 50 < len(near) < 300 and (np.diff(near) > 0).all()
+    for _ in range(3):
+        optimise_step(params, camera, np.eye(4), rgb, depth, settings)
+    assert params.steps.tolist() == [4] * 350
+    # Adam's way under a gradient that is gone: b1 / (1 - b1^2) of a step in the first iteration, and so on.
+    b1, b2 = settings.adam_beta1, settings.adam_beta2
+    factor = sum(b1**j * (1 - b1) / (1 - b1 ** (1 + j)) / np.sqrt(b2**j * (1 - b2) / (1 - b2 ** (1 + j))) for j in (1, 2, 3))
+    np.testing.assert_allclose(before[300:, 0] - params.values.numpy()[300:, 0], settings.lr_means_m * factor, rtol=5e-3)
 
 
 def test_zero_gradient_moves_nothing() -> None:
@@ -193,10 +248,15 @@ def test_extra_gradient_is_added() -> None:
     camera, settings = Camera.from_fov(32, 32, 90), GaussianSettings()
     rgb, depth = target(camera)
     params = GaussianParameters.from_model(wall(100))
-    extra = np.zeros((100, 14), np.float32)
+    pulled = np.arange(0, 100, 2, dtype=np.int32)
+    extra = np.zeros((50, 14), np.float32)
     extra[:, 2] = 100.0
-    optimise_step(params, camera, np.eye(4), rgb, depth, settings, extra_gradient=extra)
-    np.testing.assert_allclose(params.means.numpy()[:, 2], 2 - settings.lr_means_m, atol=1e-6)
+    assert np.array_equal(params.rows(pulled), params.values.numpy()[pulled])
+    optimise_step(
+        params, camera, np.eye(4), rgb, depth, settings, extra_gradient=RowGradient(pulled, extra)
+    )
+    np.testing.assert_allclose(params.means.numpy()[::2, 2], 2 - settings.lr_means_m, atol=1e-6)
+    assert (params.means.numpy()[1::2, 2] > 2 - settings.lr_means_m).any()
 
 
 def test_empty_model_takes_a_step() -> None:

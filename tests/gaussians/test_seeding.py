@@ -199,16 +199,16 @@ def test_sdf_gradient_matches_autograd() -> None:
     wanted = (0.7 * sdf.abs() + 0.3 * (1 - cosine**2))[near].mean()
     wanted.backward()
 
-    terms, gradient = sdf_gradient(params, sdf.detach().numpy(), normal.numpy(), settings)
+    terms, gradient = sdf_gradient(params.values.numpy(), sdf.detach().numpy(), normal.numpy(), settings)
     assert 0 < terms["coupled"] < 40 and terms["energy"] == pytest.approx(float(wanted.detach()), rel=1e-5)
     np.testing.assert_allclose(gradient, values.grad.numpy(), atol=1e-6)
 
 
 def test_sdf_gradient_leaves_untrusted_means_alone() -> None:
-    params = some_params(4)
+    values = some_params(4).values.numpy()
     sdf = np.array([0.01, np.nan, 3.0, 0.01])
     grad = np.array([[1.0, 0, 0], [1, 0, 0], [1, 0, 0], [0, 0, 0]])
-    terms, gradient = sdf_gradient(params, sdf, grad, GaussianSettings())
+    terms, gradient = sdf_gradient(values, sdf, grad, GaussianSettings())
     assert terms["coupled"] == 1 and gradient[0].any() and not gradient[1:].any()
     with pytest.raises(InputError, match="sdf coupling"):
-        sdf_gradient(params, sdf[:2], grad, GaussianSettings())
+        sdf_gradient(values, sdf[:2], grad, GaussianSettings())

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from active3d_pipe.information import reference
 from active3d_pipe.information.config import InformationSettings
 from active3d_pipe.information.gain import (
     FREE,
@@ -119,3 +120,31 @@ def test_enough_is_the_same_place_whatever_the_resolution():
         camera = Camera.from_fov(width, 90, 90)
         at_three_metres = view_quality(1.0, 3.0, s.quality_range_m(camera.fx))
         assert at_three_metres == pytest.approx(s.enough_quality(camera.fx))
+
+
+def random_volumes(seed):
+    """Volumes of which a part was never seen, a part is free, and a part holds surface or few rays."""
+    rng = np.random.default_rng(seed)
+    shape = (9, 8, 7)
+    a = {name: rng.random(shape, np.float32) for name in VOLUMES}
+    for name in ("free_evidence", "hit_evidence"):
+        a[name] = np.round(a[name] * 12) * (rng.random(shape) < 0.5)
+    return {name: np.ascontiguousarray(x, np.float32) for name, x in a.items()}, rng
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_kernels_equal_the_formulas_over_whole_volumes(seed):
+    a, rng = random_volumes(seed)
+    s = InformationSettings(alpha=0.6, beta=0.3, residual_bits=0.2)
+    if seed == 3:
+        a["u_final"][:] = 0
+    kind = classify(a, s)
+    np.testing.assert_array_equal(kind, reference.classify(a, s))
+    assert set(np.unique(kind)) == {FREE, OPEN, SURFACE}
+    credit = rng.random(kind.shape, np.float32)
+    got = information_volumes(a, s, ENOUGH, credit, kind)
+    want = reference.information_volumes(a, s, ENOUGH, credit, kind)
+    for name in ("value", "surface_value", "gain_imp", "gain_exp"):
+        # Differences of float32 numbers near 1.
+        np.testing.assert_allclose(getattr(got, name), getattr(want, name), rtol=1e-5, atol=1e-7)
+        assert getattr(got, name).any()

@@ -10,7 +10,8 @@ from scipy.sparse.csgraph import dijkstra
 from active3d_pipe.geometry import se3
 from active3d_pipe.planning.candidates import coarse_positions, fine_positions
 from active3d_pipe.planning.config import PlanningSettings
-from active3d_pipe.planning.free_space import build_free_space, clearance, drop_half_seen, known_free, mark_body
+from active3d_pipe.planning import reference_volumes
+from active3d_pipe.planning.free_space import build_free_space, clearance, known_free, mark_body, without_half_seen
 from active3d_pipe.planning.kernels_candidates import best_of_blocks
 from active3d_pipe.planning.kernels_distance import geodesic, open_moves
 from active3d_pipe.planning.kernels_rrt import FAR, segment_cost
@@ -177,12 +178,10 @@ def test_voxels_that_rays_passed_in_the_half_away_from_a_wall_only_are_not_free(
             cells = [c for c in range(8) if (c >> (2 - axis) & 1) == upper]
             if not any(passed[tuple(v)] >> c & 1 for c in cells):
                 want[tuple(v)] = False
-    got = free.copy()
-    drop_half_seen(got, passed)
+    got = without_half_seen(free, passed.astype(np.float32))
     assert (got == want).all() and 0 < (free & ~want).sum() < free.sum() / 2
-    untouched = free.copy()
-    drop_half_seen(untouched, np.zeros_like(passed))
-    assert (untouched == free).all()
+    assert (reference_volumes.drop_half_seen(free, passed) == want).all()
+    assert (without_half_seen(free, np.zeros(free.shape, np.float32)) == free).all()
 
 
 def test_a_wall_in_the_middle_of_voxels_that_no_ray_ended_in_is_no_free_space(seen):
