@@ -8,6 +8,7 @@ from numba import njit, prange
 
 FAR = np.float32(1e30)
 LOW = np.uint64(0xFFFFFFFF)
+LINE = 16  # int32 in a cache line
 ALL_ROWS = (1 << 27) - 1
 ALL_BUT_OLDEST = sum(0b110 << 3 * row for row in range(9))
 ALL_MOVES = ALL_ROWS & ~(1 << 13)
@@ -67,13 +68,19 @@ def distance_transform(source, reach, chebyshev):
             for j in range(ny):
                 d[i, j, k] = b[j]
     for j in prange(ny):
-        a, b = np.empty(nx, np.int32), np.empty(nx, np.int32)
-        for k in range(nz):
+        # Lines along x lie far apart in memory: taken by the cache line.
+        lines, b = np.empty((LINE, nx), np.int32), np.empty(nx, np.int32)
+        for first in range(0, nz, LINE):
+            count = min(LINE, nz - first)
             for i in range(nx):
-                a[i] = d[i, j, k]
-            _combine(a, b, nx, reach, chebyshev)
+                for m in range(count):
+                    lines[m, i] = d[i, j, first + m]
+            for m in range(count):
+                _combine(lines[m], b, nx, reach, chebyshev)
+                lines[m] = b
             for i in range(nx):
-                d[i, j, k] = b[i]
+                for m in range(count):
+                    d[i, j, first + m] = lines[m, i]
     return d
 
 

@@ -10,7 +10,9 @@ import numpy as np
 from numba import njit, prange
 
 F = np.float32
-ZERO, HALF, ONE = F(0), F(0.5), F(1)
+ZERO, ONE = F(0), F(1)
+# Transmittances count as this at least where their logarithm is taken.
+LEAST = F(1e-6)
 # Bits of the cells in the lower and the upper half of a voxel, along x, y, z.
 LOW_X, HIGH_X, LOW_Y, HIGH_Y, LOW_Z, HIGH_Z = 0x0F, 0xF0, 0x33, 0xCC, 0x55, 0xAA
 
@@ -81,25 +83,27 @@ def risk(clearance, preferred, width, out):
 
 
 @njit(parallel=True, cache=True)
-def sight(kind, hit, occupancy, passed, ended, passes, through, clear, unmet):
-    """Fill the last three (X, Y, Z): transmittance f32, u8 bits of cells that are clear, and that no ray met.
+def sight(kind, hit, occupancy, passed, ended, passes, through, log_through, clear, unmet):
+    """Fill the last four (X, Y, Z): transmittance and its log, f32, u8 bits of cells that are clear, or that no ray met.
 
     `passed`, `ended` (X, Y, Z) f32 hold bits; `passes`: share of rays that an unseen voxel lets through.
     """
     nx, ny, nz = kind.shape
+    log_passes = math.log(max(passes, LEAST))
     for i in prange(nx):
         for j in range(ny):
             for k in range(nz):
                 what = kind[i, j, k]
                 by, at = np.uint8(passed[i, j, k]), np.uint8(ended[i, j, k])
                 unmet[i, j, k] = ~(by | at)
-                if what == 0:
-                    through[i, j, k] = ONE
-                elif what == 1:
+                share, log_share = ONE, ZERO
+                if what == 1:
                     # Less where the field believes in something solid.
-                    through[i, j, k] = passes * min(max(F(2) - F(2) * occupancy[i, j, k], ZERO), ONE)
-                else:
-                    through[i, j, k] = ZERO
+                    share = passes * min(max(F(2) - F(2) * occupancy[i, j, k], ZERO), ONE)
+                    log_share = log_passes if share == passes else math.log(max(share, LEAST))
+                elif what == 2:
+                    share, log_share = ZERO, math.log(LEAST)
+                through[i, j, k], log_through[i, j, k] = share, log_share
                 clear[i, j, k] = np.uint8(255) if what == 0 and hit[i, j, k] == ZERO else by & ~at
 
 

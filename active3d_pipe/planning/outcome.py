@@ -58,7 +58,7 @@ def expected_along(field: RewardField, poses: np.ndarray, camera: Camera) -> tup
     sums = kernels.path_gain(
         np.ascontiguousarray((poses[:, :3, 3] - grid.origin) / grid.voxel_size, dtype=np.float32),
         np.ascontiguousarray(poses[:, :3, :3], dtype=np.float32), ray_fan(camera, stride)[2].astype(np.float32),
-        field.opaque, field.skip, field.kind, np.log(np.maximum(field.through, np.float32(1e-6))), field.quality,
+        field.opaque, field.skip, field.kind, field.log_through, field.quality,
         field.normal, field.clear, field.gain_imp, field.gain_exp, grid.shape, np.float32(grid.voxel_size),
         np.float32(field.max_range_m), np.float32(field.enough_quality), np.float32(field.quality_range_m),
     )

@@ -3,6 +3,7 @@
 import numpy as np
 
 from active3d_pipe.information.gain import FREE, OPEN
+from active3d_pipe.planning.kernels_volumes import LEAST
 
 # Bits of the cells in the lower and the upper half of a voxel, along x, y, z.
 HALVES = ((0x0F, 0xF0), (0x33, 0xCC), (0x55, 0xAA))
@@ -43,13 +44,13 @@ def risk(clearance: np.ndarray, preferred: float, width: float) -> np.ndarray:
 
 def sight(
     kind: np.ndarray, hit: np.ndarray, occupancy: np.ndarray, passed: np.ndarray, ended: np.ndarray, passes: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Transmittance, bits of clear cells, bits of cells that no ray met."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Transmittance, its logarithm, bits of clear cells, bits of cells that no ray met."""
     by, at = passed.astype(np.uint8), ended.astype(np.uint8)
     solid = np.clip(2 - 2 * occupancy, 0, 1)
     through = np.where(kind == OPEN, passes * solid, np.where(kind == FREE, 1, 0)).astype(np.float32)
     clear = np.where((kind == FREE) & (hit == 0), np.uint8(255), by & ~at)
-    return through, clear, ~(by | at)
+    return through, np.log(np.maximum(through, LEAST)), clear, ~(by | at)
 
 
 def half_seen(kind: np.ndarray, passed: np.ndarray) -> np.ndarray:

@@ -39,6 +39,7 @@ class RewardField:
     skip: np.ndarray
     value: np.ndarray
     through: np.ndarray
+    log_through: np.ndarray
     surface_value: np.ndarray
     quality: np.ndarray
     normal: np.ndarray
@@ -77,9 +78,10 @@ def build_reward_field(
     kind = classify(volume.arrays, information)
     hit, passed, ended = volume["hit_evidence"], volume["cells_passed"], volume["cells_hit"]
     half_seen, clear, unmet, of_interest, opaque, open_bits = (np.zeros(grid.shape, np.uint8) for _ in range(6))
-    through, normal = np.empty(grid.shape, np.float32), np.zeros((*grid.shape, 3), np.int8)
+    through, log_through = (np.empty(grid.shape, np.float32) for _ in range(2))
+    normal = np.zeros((*grid.shape, 3), np.int8)
     passes = np.float32(np.exp(-grid.voxel_size / settings.unknown_free_path_m))
-    kernels_volumes.sight(kind, hit, volume["occupancy"], passed, ended, passes, through, clear, unmet)
+    kernels_volumes.sight(kind, hit, volume["occupancy"], passed, ended, passes, through, log_through, clear, unmet)
     kernels_sight.surface_normals(kind, normal)
     # A voxel is larger than what is in it: the underside of a table, the edge of a frame, the gap behind a sofa lie in
     # voxels that count as surface seen, from the other side. A volume without cells has no open ones, and its surface
@@ -104,7 +106,7 @@ def build_reward_field(
     volumes.value[at] = 4 * np.float32(whole) * credit.reshape(grid.shape)[at]
     return RewardField(
         grid, information.quality_range_m(camera.fx), enough, reach, kind.ravel(), opaque, skip,
-        volumes.value.ravel(), through.ravel(), volumes.surface_value.ravel(), quality, normal.reshape(-1, 3),
+        volumes.value.ravel(), through.ravel(), log_through.ravel(), volumes.surface_value.ravel(), quality, normal.reshape(-1, 3),
         *cells, np.float32(whole) * cell_credit,
         volumes.gain_imp.ravel(), volumes.gain_exp.ravel(),
     )
@@ -202,7 +204,7 @@ def exact_terms(
     stride = ray_stride or fan_stride(camera, grid.voxel_size, field.max_range_m)
     sums = kernels.frustum_gain(
         *_in_voxels(grid, poses), ray_fan(camera, stride)[2].astype(np.float32),
-        field.opaque, field.skip, field.kind, field.value, np.log(np.maximum(field.through, np.float32(1e-6))),
+        field.opaque, field.skip, field.kind, field.value, field.log_through,
         field.surface_value, field.quality, field.normal, field.clear, field.open_bits, field.cell_value,
         field.gain_imp, field.gain_exp, grid.shape, np.float32(grid.voxel_size), np.float32(field.max_range_m),
         np.float32(field.enough_quality), np.float32(field.quality_range_m),

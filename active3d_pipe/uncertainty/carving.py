@@ -42,10 +42,12 @@ class RayEvidence:
 
     def joined(self, newer: "RayEvidence") -> "RayEvidence":
         """Both together: counts add up, the better view stays, cells are joined."""
-        return RayEvidence(
-            self.free + newer.free, self.hit + newer.hit, np.maximum(self.quality, newer.quality),
-            self.passed | newer.passed, self.ended | newer.ended,
-        )
+        out = RayEvidence(*(a.copy() for a in self._arrays()))
+        kernels.join(*newer._arrays(), *out._arrays())
+        return out
+
+    def _arrays(self) -> tuple[np.ndarray, ...]:
+        return self.free, self.hit, self.quality, self.passed, self.ended
 
 
 def integrate_depth(grid: VoxelGrid, frames: Sequence[Frame], settings: UncertaintySettings) -> RayEvidence:
@@ -67,10 +69,9 @@ def integrate_depth(grid: VoxelGrid, frames: Sequence[Frame], settings: Uncertai
             *_stacked(group, _stride(grid, group, settings)), grid.origin, 1 / grid.voxel_size,
             settings.reference_footprint_m, free, hit, quality, passed, ended,
         )
-    return RayEvidence(
-        free.sum(0).astype(np.float32), hit.sum(0).astype(np.float32), quality.max(0),
-        np.bitwise_or.reduce(passed), np.bitwise_or.reduce(ended),
-    )
+    out = RayEvidence.none(grid)
+    kernels.gather(free, hit, quality, passed, ended, *out._arrays())
+    return out
 
 
 def looks_in_vain(

@@ -1,12 +1,9 @@
 """View-dependent local uncertainty: residuals of the Gaussian branch, back-projected (eq. view_uncertainty)."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 from active3d_pipe.errors import InputError
 from active3d_pipe.geometry import projection
@@ -136,6 +133,16 @@ def backproject(
         residual: float32 [X, Y, Z] in 0..1, 0 where no view looked.
         coverage: float32 [X, Y, Z], share of the views that saw the voxel.
     """
+    total, seen = _summed(grid, views, settings)
+    count = seen.sum(0).astype(np.float32)
+    residual = total.sum(0) / np.maximum(count, 1)
+    return residual, count / np.float32(max(len(views), 1))
+
+
+def _summed(
+    grid: VoxelGrid, views: Sequence[ViewResidual], settings: UncertaintySettings
+) -> tuple[np.ndarray, np.ndarray]:
+    """Sums over views of residuals, float32, and of the views that saw a voxel, int32; (CHUNKS, X, Y, Z)."""
     total = np.zeros((kernels.CHUNKS, *grid.shape), np.float32)
     seen = np.zeros((kernels.CHUNKS, *grid.shape), np.int32)
     s = settings.residual_stride
@@ -147,9 +154,7 @@ def backproject(
             np.stack([v.T_world_camera for v in group])[:, :3].astype(np.float64), s // 2, s,
             grid.origin, 1 / grid.voxel_size, np.float32(MIN_WEIGHT), total, seen,
         )
-    count = seen.sum(0).astype(np.float32)
-    residual = total.sum(0) / np.maximum(count, 1)
-    return residual, count / np.float32(max(len(views), 1))
+    return total, seen
 
 
 def explicit_uncertainty(
@@ -167,27 +172,16 @@ def explicit_uncertainty(
     before = np.zeros(grid.shape, np.float32) if previous is None else previous
     if not views:
         return before
-    residual, coverage = backproject(grid, views, settings)
-    count = coverage * np.float32(len(views))
-    looked_at = _box_of(count > 0, math.ceil(BLUR_REACH * settings.residual_blur_voxels) + 1)
-    residual, count, then = residual[looked_at], count[looked_at], before[looked_at]
-    if settings.residual_blur_voxels > 0:
-        blur = partial(gaussian_filter, sigma=settings.residual_blur_voxels, mode="constant", truncate=BLUR_REACH)
-        total, count = blur(residual * count), blur(count)
-        seen = count > MIN_VIEWS
-        residual = np.where(seen, total / np.where(seen, count, 1), 0)
-        count = np.where(seen, count, 0)
-    memory = np.float32(settings.residual_memory) * (then > 0)
-    gain = np.divide(count, count + memory, out=np.zeros_like(count), where=count > 0)
-    out = before.copy()
-    out[looked_at] = then + gain * (residual - then)
+    out = np.empty(grid.shape, np.float32)
+    kernels.running_mean(
+        *_summed(grid, views, settings), blur_taps(settings.residual_blur_voxels), np.float32(MIN_VIEWS),
+        np.float32(settings.residual_memory), before, out,
+    )
     return out
 
 
-def _box_of(mask: np.ndarray, margin: int) -> tuple[slice, ...]:
-    """The smallest box, and a margin, that holds all that is true in a volume: views look at a part of it."""
-    box = []
-    for axis in range(3):
-        at = np.flatnonzero(mask.any(axis=tuple(a for a in range(3) if a != axis)))
-        box.append(slice(max(int(at[0]) - margin, 0), int(at[-1]) + margin + 1) if len(at) else slice(0, 0))
-    return tuple(box)
+def blur_taps(sigma: float) -> np.ndarray:
+    """(2 r + 1,) float32 weights of a Gaussian blur along one axis; sigma in voxels, 0: none."""
+    r = int(BLUR_REACH * sigma + 0.5)
+    weights = np.exp(-0.5 * (np.arange(-r, r + 1) / max(sigma, 1e-6)) ** 2)
+    return (weights / weights.sum()).astype(np.float32)

@@ -155,3 +155,68 @@ def mean_at_readings(depth, camera, pose, first, stride, origin, size, values):
                 total += values[a, b, c]
                 count += 1
     return total / count if count else 0.0
+
+
+@njit(parallel=True, cache=True)
+def near_attention(attention, u):
+    """u (X, Y, Z) f32 times the largest attention of the 3 x 3 x 3 voxels around, in place; most of u is 0."""
+    nx, ny, nz = u.shape
+    for i in prange(nx):
+        for j in range(ny):
+            for k in range(nz):
+                if u[i, j, k] == 0.0:
+                    continue
+                most = attention[i, j, k]
+                for a in range(max(i - 1, 0), min(i + 2, nx)):
+                    for b in range(max(j - 1, 0), min(j + 2, ny)):
+                        for c in range(max(k - 1, 0), min(k + 2, nz)):
+                            most = max(most, attention[a, b, c])
+                u[i, j, k] *= most
+
+
+@njit(parallel=True, cache=True)
+def running_mean(total, seen, taps, least_views, memory, before, out):
+    """out (X, Y, Z) f32: `before`, moved towards the mean residual of what views saw around (`explicit`).
+
+    total f32 and seen i32 (CHUNKS, X, Y, Z) are sums over views of residuals and of 1; `taps` (2 r + 1,) f32 blurs
+    both, along every axis, what lies outside being 0.
+    """
+    chunks, nx, ny, nz = total.shape
+    r = len(taps) // 2
+    blurred = np.zeros((2, nx, ny, nz), np.float32)  # along z and y
+    for i in prange(nx):
+        sums, along = np.zeros((2, nz), np.float32), np.zeros((2, ny, nz), np.float32)
+        touched = np.zeros(ny, np.bool_)
+        for j in range(ny):
+            for k in range(nz):
+                value, count = np.float32(0.0), 0
+                for c in range(chunks):
+                    value += total[c, i, j, k]
+                    count += seen[c, i, j, k]
+                sums[0, k], sums[1, k] = value, np.float32(count)
+                touched[j] |= count > 0
+            if touched[j]:
+                for k in range(nz):
+                    for m in range(max(k - r, 0), min(k + r + 1, nz)):
+                        w = taps[m - k + r]
+                        along[0, j, k] += w * sums[0, m]
+                        along[1, j, k] += w * sums[1, m]
+        for j in range(ny):
+            for m in range(max(j - r, 0), min(j + r + 1, ny)):
+                if touched[m]:
+                    w = taps[m - j + r]
+                    for k in range(nz):
+                        blurred[0, i, j, k] += w * along[0, m, k]
+                        blurred[1, i, j, k] += w * along[1, m, k]
+    for i in prange(nx):
+        for j in range(ny):
+            for k in range(nz):
+                value, count = np.float32(0.0), np.float32(0.0)
+                for m in range(max(i - r, 0), min(i + r + 1, nx)):
+                    value += taps[m - i + r] * blurred[0, m, j, k]
+                    count += taps[m - i + r] * blurred[1, m, j, k]
+                then = before[i, j, k]
+                out[i, j, k] = then
+                if count > least_views:
+                    kept = memory if then > 0.0 else np.float32(0.0)
+                    out[i, j, k] = then + count / (count + kept) * (value / count - then)

@@ -252,3 +252,37 @@ def mark_vain(depths, cameras, poses, reaches, starts, stride, origin, inv_voxel
                 depths[f], camera, poses[f], (reaches[f, 0], reaches[f, 1]), (starts[f, 0], starts[f, 1]), stride,
                 (origin, inv_voxel), range_m, blocked, stamp, f, flat_vain,
             )
+
+
+@njit(parallel=True, cache=True)
+def gather(free, hit, quality, passed, ended, all_free, all_hit, all_quality, all_passed, all_ended):
+    """Bring the chunks (CHUNKS, X, Y, Z) together: sums, the largest, bits; the last five are (X, Y, Z) zeros."""
+    chunks, nx, ny, nz = free.shape
+    for i in prange(nx):
+        for c in range(chunks):
+            for j in range(ny):
+                for k in range(nz):
+                    f, h, by, at = free[c, i, j, k], hit[c, i, j, k], passed[c, i, j, k], ended[c, i, j, k]
+                    if f == 0 and h == 0 and by == 0 and at == 0:
+                        continue
+                    all_free[i, j, k] += np.float32(f)
+                    all_hit[i, j, k] += np.float32(h)
+                    all_quality[i, j, k] = max(all_quality[i, j, k], quality[c, i, j, k])
+                    all_passed[i, j, k] |= by
+                    all_ended[i, j, k] |= at
+
+
+@njit(parallel=True, cache=True)
+def join(free, hit, quality, passed, ended, all_free, all_hit, all_quality, all_passed, all_ended):
+    """Add evidence, the first five, to the last five, in place: counts add up, the better view stays, bits are joined."""
+    nx, ny, nz = free.shape
+    for i in prange(nx):
+        for j in range(ny):
+            for k in range(nz):
+                if free[i, j, k] == 0 and hit[i, j, k] == 0 and passed[i, j, k] == 0 and ended[i, j, k] == 0:
+                    continue
+                all_free[i, j, k] += free[i, j, k]
+                all_hit[i, j, k] += hit[i, j, k]
+                all_quality[i, j, k] = max(quality[i, j, k], all_quality[i, j, k])
+                all_passed[i, j, k] |= passed[i, j, k]
+                all_ended[i, j, k] |= ended[i, j, k]

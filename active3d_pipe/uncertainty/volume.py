@@ -4,12 +4,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import maximum_filter
 
 from active3d_pipe.errors import InputError, NumericalError
 from active3d_pipe.information.gain import entropy_drop
 from active3d_pipe.structures import Frame, GaussianModel, UncertaintyVolume, VoxelGrid
-from active3d_pipe.uncertainty import explicit, fusion, occupancy
+from active3d_pipe.uncertainty import explicit, fusion, kernels, occupancy
 from active3d_pipe.uncertainty.carving import RayEvidence, integrate_depth, looks_in_vain
 from active3d_pipe.uncertainty.config import UncertaintySettings
 from active3d_pipe.uncertainty.explicit import ViewResidual
@@ -82,8 +81,8 @@ def compute_volume(  # noqa: PLR0913  (the inputs of the stage, by name)
     last_u_exp = None if previous is None else previous["u_exp"]
     # Residuals lie at observed depths, never at phantoms, and their trilinear weights reach the voxels beside a
     # surface, which may prove to hold it; only what lies in the midst of free space is forgotten.
-    near = maximum_filter(terms.attention, size=3, mode="nearest")
-    u_exp = near * explicit.explicit_uncertainty(grid, views, last_u_exp, settings)
+    u_exp = explicit.explicit_uncertainty(grid, views, last_u_exp, settings).copy()
+    kernels.near_attention(terms.attention, u_exp)
 
     rows, targets = revealed_rows(grid, previous, fresh, predicted, settings)
     statistics = _statistics_of(previous).updated(rows, targets, settings.forgetting)
