@@ -49,8 +49,8 @@ def measure(values, places):
 def adam(values, moment1, moment2, steps, places, rows, grad, rates, beta1, beta2):
     """One Adam step (Kingma & Ba 2015) on the rows `rows` (M,) of `values` (N, 14) with `grad` (M, 14), in place.
 
-    `places` (N, 4) is kept as `measure` makes it. `steps` (N,) int32 counts the updates of each primitive, so that the bias correction fits those that were
-    added later; `rates` (14,) learning rates.
+    `places` (N, 4) is kept as `measure` makes it. `steps` (N,) int32 counts the updates of each primitive, so that the
+    bias correction fits those that were added later; `rates` (14,) learning rates.
     """
     n, width = grad.shape
     one_less_1, one_less_2 = ONE - beta1, ONE - beta2

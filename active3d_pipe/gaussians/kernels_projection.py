@@ -229,7 +229,8 @@ def chain_rule(
                 q11 += g0 * (a0 * inv0 - kc)
             d00, d01, d02 = q00 * v00 + q01 * v10, q00 * v01 + q01 * v11, q00 * v02 + q01 * v12
             d10, d11, d12 = q01 * v00 + q11 * v10, q01 * v01 + q11 * v11, q01 * v02 + q11 * v12
-            grad[out, 3], grad[out, 4], grad[out, 5] = d00 * v00 + d10 * v10, d01 * v01 + d11 * v11, d02 * v02 + d12 * v12
+            grad[out, 3], grad[out, 4] = d00 * v00 + d10 * v10, d01 * v01 + d11 * v11
+            grad[out, 5] = d02 * v02 + d12 * v12
             d00, d01, d02, d10, d11, d12 = d00 * s0, d01 * s1, d02 * s2, d10 * s0, d11 * s1, d12 * s2
 
             # Rotation: dRq = (J R)^T dE, then to the quaternion, without its radial part.

@@ -32,7 +32,7 @@ class GaussianParameters:
     """
 
     def __init__(self, values: Tensor, moment1: Tensor, moment2: Tensor, steps: Tensor) -> None:
-        self._arrays = (values, moment1, moment2, steps)
+        self._arrays: tuple[Tensor, ...] = (values, moment1, moment2, steps)
         self.workspace = Workspace()
         self._room: tuple[Tensor, ...] = ()
         # Iterations so far, the one that each primitive has come to, and how Adam ran in the last.
@@ -79,7 +79,7 @@ class GaussianParameters:
         return self._arrays
 
     def _catch_up(self, rows: np.ndarray) -> None:
-        kernels_adam.catch_up(*self._plain(), self._done, self._now, rows, *self._adam)
+        kernels_adam.catch_up(*self._plain(), self._done, self._now, rows, *self._adam)  # type: ignore[call-arg]
 
     def _replace(self, arrays: tuple[Tensor, ...]) -> None:
         """Other arrays, none of which owes a step."""
@@ -222,7 +222,7 @@ class GaussianParameters:
         """
         n, chunks = len(self), raster_pass.CHUNKS
         which, counts = self.workspace.get("may_be_seen", (n,), np.int32), np.zeros(chunks, np.int64)
-        kernels_adam.near(
+        kernels_adam.near(  # type: ignore[call-arg]
             *self._plain(), self._done, self._now, *self._adam, *raster_pass.view_arrays(camera, T_world_camera),
             np.float32(dilation_px2), chunks, which, counts,
         )
@@ -257,7 +257,8 @@ class GaussianParameters:
         self._adam = (
             rates * np.float32(learning_rate_scale), np.float32(settings.adam_beta1), np.float32(settings.adam_beta2)
         )
-        kernels_adam.adam(*self._plain(), rows, np.ascontiguousarray(grad, dtype=np.float32), *self._adam)
+        grad = np.ascontiguousarray(grad, dtype=np.float32)
+        kernels_adam.adam(*self._plain(), rows, grad, *self._adam)  # type: ignore[call-arg]
         if settings.visible_only:
             return
         self._now += 1

@@ -160,7 +160,7 @@ def information_volumes(
     level = uncertainty_level(u, (free > 0) | (hit > 0))
     filled = tuple(np.zeros(kind.shape, np.float32) for _ in range(4))
     weights = (level, settings.alpha, settings.beta, settings.surface_weight, settings.residual_bits)
-    kernels.information(
+    kernels.information(  # type: ignore[call-arg]
         kind, free, hit, arrays["occupancy"], u, arrays["entropy"], arrays["entropy_imp"], arrays["entropy_exp"],
         arrays["view_quality"], trust, *(np.float32(w) for w in weights), np.float32(settings.settled_rays),
         np.float32(enough_quality), *filled,

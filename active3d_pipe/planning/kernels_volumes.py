@@ -84,7 +84,7 @@ def risk(clearance, preferred, width, out):
 
 @njit(parallel=True, cache=True)
 def sight(kind, hit, occupancy, passed, ended, passes, through, log_through, clear, unmet):
-    """Fill the last four (X, Y, Z): transmittance and its log, f32, u8 bits of cells that are clear, or that no ray met.
+    """Fill the last four (X, Y, Z): transmittance and its logarithm f32, u8 bits of clear cells and of unmet ones.
 
     `passed`, `ended` (X, Y, Z) f32 hold bits; `passes`: share of rays that an unseen voxel lets through.
     """

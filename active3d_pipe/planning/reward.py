@@ -95,7 +95,7 @@ def build_reward_field(
     kernels_volumes.open_half_seen(half_seen, hit, kind, of_interest, opaque)
     skip = kernels_distance.distance_transform(of_interest, LONGEST_SKIP, True).astype(np.uint8).ravel()
     quality = np.ascontiguousarray(volume["view_quality"]).ravel()
-    opaque, cells = opaque.ravel(), (clear.ravel(), open_bits.ravel())
+    cells = clear.ravel(), open_bits.ravel()
     looks = _looks(volume, (skip, kind.ravel(), quality, normal.reshape(-1, 3)), cells, walked_poses, camera, settings)
     credit, cell_credit = (kernels_volumes.powers(np.float32(settings.credit_factor), n) for n in looks)
     # An eighth of what an open voxel is worth that may turn out either way, times the weight.
@@ -105,9 +105,9 @@ def build_reward_field(
     at = half_seen.view(bool)
     volumes.value[at] = 4 * np.float32(whole) * credit.reshape(grid.shape)[at]
     return RewardField(
-        grid, information.quality_range_m(camera.fx), enough, reach, kind.ravel(), opaque, skip,
-        volumes.value.ravel(), through.ravel(), log_through.ravel(), volumes.surface_value.ravel(), quality, normal.reshape(-1, 3),
-        *cells, np.float32(whole) * cell_credit,
+        grid, information.quality_range_m(camera.fx), enough, reach, kind.ravel(), opaque.ravel(), skip,
+        volumes.value.ravel(), through.ravel(), log_through.ravel(), volumes.surface_value.ravel(), quality,
+        normal.reshape(-1, 3), *cells, np.float32(whole) * cell_credit,
         volumes.gain_imp.ravel(), volumes.gain_exp.ravel(),
     )
 

@@ -189,12 +189,12 @@ def running_mean(total, seen, taps, least_views, memory, before, out):
         touched = np.zeros(ny, np.bool_)
         for j in range(ny):
             for k in range(nz):
-                value, count = np.float32(0.0), 0
+                value, views = np.float32(0.0), 0
                 for c in range(chunks):
                     value += total[c, i, j, k]
-                    count += seen[c, i, j, k]
-                sums[0, k], sums[1, k] = value, np.float32(count)
-                touched[j] |= count > 0
+                    views += seen[c, i, j, k]
+                sums[0, k], sums[1, k] = value, np.float32(views)
+                touched[j] |= views > 0
             if touched[j]:
                 for k in range(nz):
                     for m in range(max(k - r, 0), min(k + r + 1, nz)):

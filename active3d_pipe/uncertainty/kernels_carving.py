@@ -274,7 +274,7 @@ def gather(free, hit, quality, passed, ended, all_free, all_hit, all_quality, al
 
 @njit(parallel=True, cache=True)
 def join(free, hit, quality, passed, ended, all_free, all_hit, all_quality, all_passed, all_ended):
-    """Add evidence, the first five, to the last five, in place: counts add up, the better view stays, bits are joined."""
+    """Add evidence, the first five, to the last five, in place: counts add up, the better view stays."""
     nx, ny, nz = free.shape
     for i in prange(nx):
         for j in range(ny):

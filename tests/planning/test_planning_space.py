@@ -8,9 +8,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from active3d_pipe.geometry import se3
+from active3d_pipe.planning import reference_volumes
 from active3d_pipe.planning.candidates import coarse_positions, fine_positions
 from active3d_pipe.planning.config import PlanningSettings
-from active3d_pipe.planning import reference_volumes
 from active3d_pipe.planning.free_space import build_free_space, clearance, known_free, mark_body, without_half_seen
 from active3d_pipe.planning.kernels_candidates import best_of_blocks
 from active3d_pipe.planning.kernels_distance import geodesic, open_moves
