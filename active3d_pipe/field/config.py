@@ -48,7 +48,10 @@ class FieldSettings(Settings):
     sigma_prior_m: float = Field(0.3, gt=0, description="standard deviation of the SDF where nothing was seen, m")
     sigma_floor_m: float = Field(0.002, gt=0, description="smallest standard deviation of the SDF, m")
 
-    rays: int = Field(768, gt=0, description="rays per iteration")
+    rays: int = Field(512, gt=0, description="rays per iteration")
+    surface_points: int = Field(
+        4096, ge=0, description="and readings at which the SDF is held at zero: a sixteenth of what a ray costs, each"
+    )
     free_samples: int = Field(6, ge=0, description="stratified samples a ray between camera and truncation band")
     surface_samples: int = Field(9, gt=1, description="stratified samples a ray within the truncation band")
     behind_fraction: float = Field(
@@ -65,6 +68,7 @@ class FieldSettings(Settings):
     weight_rgb: float = Field(5.0, ge=0, description="weight of the colour loss")
     weight_depth: float = Field(0.1, ge=0, description="weight of the rendered depth loss, 1/m2")
     weight_sdf: float = Field(1000.0, ge=0, description="weight of the SDF loss in the truncation band, 1/m2")
+    weight_surface: float = Field(1000.0, ge=0, description="weight of the squared SDF at readings, 1/m2")
     weight_free: float = Field(10.0, ge=0, description="weight of the free-space loss, in truncation units")
     weight_uncertainty: float = Field(0.02, ge=0, description="weight of the uncertainty losses")
     weight_prior: float = Field(0.005, ge=0, description="weight of the uncertainty prior in unseen space")

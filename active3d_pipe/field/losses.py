@@ -54,6 +54,11 @@ def sdf_loss(
     return masked_mean((sdf - target).square(), mask) * truncation_m**2
 
 
+def surface_loss(sdf: torch.Tensor, truncation_m: float) -> torch.Tensor:
+    """Mean squared SDF of points on the surface, m2; (N,). Zero without any."""
+    return sdf.square().mean() * truncation_m**2 if len(sdf) else sdf.sum()
+
+
 def free_space_loss(sdf: torch.Tensor, target: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
     """Mean squared difference to the truncated distance in front of the band; (R, F) each."""
     return masked_mean((sdf - target).square(), mask)

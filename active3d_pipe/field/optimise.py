@@ -72,6 +72,7 @@ def field_step(
     rng: np.random.Generator,
     rate: float = 1.0,
     timings: Callable[[str, float], None] | None = None,
+    surface: np.ndarray | None = None,
 ) -> dict[str, float]:
     """One iteration on a batch of rays; changes `field` and `optimiser` in place.
 
@@ -82,6 +83,7 @@ def field_step(
         rng: draws sample depths and prior points.
         rate: factor on the learning rates (annealing).
         timings: called with (part, seconds) for the parts sample, forward, backward.
+        surface: (N, 3) float32 points on the surface (`rays.surface_points`), world, m: the SDF is zero there.
 
     Returns:
         The unweighted losses by name and `total`; NumericalError when the total is not finite.
@@ -90,15 +92,17 @@ def field_step(
     z_free, z_near = sample_depths(batch, settings, rng)
     prior = _prior_points(field, settings, rng)
     points_free, points_near = points_on_rays(batch, z_free), points_on_rays(batch, z_near)
-    points = np.concatenate([points_free, points_near, *prior])
+    surface = np.zeros((0, 3), np.float32) if surface is None else surface
+    points = np.concatenate([points_free, points_near, *prior, surface])
     inside = np.repeat(batch.valid, z_free.shape[1]), np.repeat(batch.valid, z_near.shape[1])
-    field.count_visits(np.concatenate([points_free[inside[0]], points_near[inside[1]]]))
+    field.count_visits(np.concatenate([points_free[inside[0]], points_near[inside[1]], surface]))
     sampled = perf_counter()
 
     terms = _losses(field, batch, settings, z_free, z_near, points, points_near, prior[0])
     weights = {
         "rgb": settings.weight_rgb, "depth": settings.weight_depth, "sdf": settings.weight_sdf,
-        "free": settings.weight_free, "uncertainty": settings.weight_uncertainty, "prior": settings.weight_prior,
+        "surface": settings.weight_surface, "free": settings.weight_free,
+        "uncertainty": settings.weight_uncertainty, "prior": settings.weight_prior,
         "smoothness": settings.weight_smoothness,
     }
     total = torch.stack([terms[name] * weight for name, weight in weights.items()]).sum()
@@ -131,6 +135,7 @@ def _losses(
 ) -> dict[str, torch.Tensor]:
     rays, free, near = len(batch), z_free.shape[1], z_near.shape[1]
     n_free, n_near, n_prior = rays * free, rays * near, len(prior_points)
+    start = n_free + n_near
     band = settings.truncation_m
     g = field.geometry(points)
     at = slice(n_free, n_free + n_near)
@@ -157,16 +162,17 @@ def _losses(
         "rgb": losses.rgb_loss(rendered, torch.from_numpy(batch.color), valid),
         "depth": losses.depth_loss(depth, observed, valid),
         "sdf": losses.sdf_loss(sdf, target, is_near, band),
+        "surface": losses.surface_loss(g.sdf[start + 2 * n_prior :], band),
         "free": losses.free_space_loss(sdf, target, is_free),
         # The paper's term on rendered depth, and the same likelihood on the samples themselves: a ray
         # gives weight to the surface only, so that known free space would otherwise stay at its prior.
         "uncertainty": losses.uncertainty_loss((depth - observed) / band, variance, valid)
         + losses.uncertainty_loss(sdf - target, sigma.square(), mask),
         "prior": losses.prior_loss(
-            g.sigma[n_free + n_near : n_free + n_near + n_prior], settings.sigma_prior_m / band,
+            g.sigma[start : start + n_prior], settings.sigma_prior_m / band,
             torch.from_numpy(~field.visited(prior_points)),
         ),
         "smoothness": losses.smoothness_loss(
-            g.sdf[n_free + n_near : n_free + n_near + n_prior], g.sdf[n_free + n_near + n_prior :]
+            g.sdf[start : start + n_prior], g.sdf[start + n_prior : start + 2 * n_prior]
         ),
     }

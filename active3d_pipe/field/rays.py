@@ -83,6 +83,16 @@ def sample_rays(
     )
 
 
+def surface_points(
+    frames: Sequence[Frame], count: int, rng: np.random.Generator, weights: np.ndarray | None = None
+) -> np.ndarray:
+    """(N, 3) float32 world points at `count` readings, or fewer where there are none; arguments as of `sample_rays`."""
+    if count == 0:
+        return np.zeros((0, 3), np.float32)
+    batch = sample_rays(frames, count, rng, weights)
+    return points_on_rays(batch, batch.depth[:, None])[batch.valid]
+
+
 def _intrinsics(frame: Frame) -> tuple[float, float, float, float, float]:
     c = frame.camera
     return c.fx, c.fy, c.cx, c.cy, c.far

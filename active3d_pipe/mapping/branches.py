@@ -11,7 +11,7 @@ import numpy as np
 
 from active3d_pipe.errors import ConfigError
 from active3d_pipe.field.optimise import field_step
-from active3d_pipe.field.rays import sample_rays
+from active3d_pipe.field.rays import sample_rays, surface_points
 from active3d_pipe.field.sdf_field import SdfField
 from active3d_pipe.field.tsdf import TsdfField
 from active3d_pipe.gaussians.config import GaussianSettings
@@ -96,18 +96,19 @@ def train_field(
     hybrid: HybridMap, frames: Sequence[Frame], weights: np.ndarray | None, rng: np.random.Generator, clock: Clock,
     rate: float = 1.0,
 ) -> dict[str, float]:
-    """One iteration of the implicit branch on rays of `frames`."""
+    """One iteration of the implicit branch on rays and readings of `frames`."""
     settings = hybrid.settings.field
     if not isinstance(hybrid.field, SdfField) or hybrid.optimiser is None:
         raise ConfigError("mapping: a TSDF is fused, not trained")
     hybrid.field_changed()
     with clock.of("ray sampling"):
         batch = sample_rays(frames, settings.rays, rng, weights)
+        surface = surface_points(frames, settings.surface_points, rng, weights)
 
     def add(part: str, seconds: float) -> None:
         clock.seconds["ray sampling" if part == "sample" else f"field {part}"] += seconds
 
-    return field_step(hybrid.field, hybrid.optimiser, batch, settings, rng, rate, add)
+    return field_step(hybrid.field, hybrid.optimiser, batch, settings, rng, rate, add, surface)
 
 
 def fuse(hybrid: HybridMap, frames: Sequence[Frame], clock: Clock) -> None:

@@ -72,7 +72,7 @@ class MappingSettings(Settings):
     seeding_share: float = Field(0.8, gt=0, le=1, description="... seeding at this; the rest is for the refinement")
     refinement_growth: float = Field(0.75, ge=0, description="primitives that refinement may add, relative to before")
     learning_rate_scale: float = Field(0.4, gt=0, description="scale on the Gaussians' learning rates while exploring")
-    refinement_iterations: int = Field(3000, ge=0, description="annealed iterations over all logged frames, in export")
+    refinement_iterations: int = Field(4000, ge=0, description="annealed iterations over all logged frames, in export")
     refinement_balance: float = Field(
         0.5, ge=0, description="visits of the refinement to a frame go with this power of its exposure (frame_order)"
     )

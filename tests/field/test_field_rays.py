@@ -6,7 +6,7 @@ from room_with_ball import scene_color, scene_sdf
 
 from active3d_pipe.errors import InputError
 from active3d_pipe.field.config import FieldSettings
-from active3d_pipe.field.rays import points_on_rays, sample_depths, sample_rays
+from active3d_pipe.field.rays import points_on_rays, sample_depths, sample_rays, surface_points
 from active3d_pipe.geometry import se3
 from active3d_pipe.structures import Camera, Frame
 
@@ -17,6 +17,18 @@ def test_rays_end_on_the_surface_they_saw(frames):
     assert b.valid.all() and len(b) == 500
     np.testing.assert_allclose(scene_sdf(hits), 0, atol=1e-5)
     np.testing.assert_allclose(b.color, scene_color(hits), atol=1 / 255 + 1e-6)
+
+
+def test_surface_points_are_readings(frames):
+    f = frames[0]
+    hole = f.depth.copy()
+    hole[:, :40] = 0
+    for given, most in ((frames, 300), ([dataclasses.replace(f, depth=hole)], 400)):
+        points = surface_points(given, most, np.random.default_rng(0))
+        assert points.dtype == np.float32 and 0.8 * most < len(points) <= most
+        np.testing.assert_allclose(scene_sdf(points), 0, atol=1e-5)
+    assert surface_points([dataclasses.replace(f, depth=0 * hole)], 9, np.random.default_rng(0)).shape == (0, 3)
+    assert surface_points(frames, 0, np.random.default_rng(0)).shape == (0, 3)
 
 
 def test_slope_gives_the_distance_to_the_surface(frames):
