@@ -138,6 +138,7 @@ def _losses(
     start = n_free + n_near
     band = settings.truncation_m
     g = field.geometry(points)
+    on_surface, its_sigma = g.sdf[start + 2 * n_prior :], g.sigma[start + 2 * n_prior :]
     at = slice(n_free, n_free + n_near)
     color = field.color(points_near, g.oneblob[at], g.features[at]).view(rays, near, 3)
 
@@ -162,12 +163,14 @@ def _losses(
         "rgb": losses.rgb_loss(rendered, torch.from_numpy(batch.color), valid),
         "depth": losses.depth_loss(depth, observed, valid),
         "sdf": losses.sdf_loss(sdf, target, is_near, band),
-        "surface": losses.surface_loss(g.sdf[start + 2 * n_prior :], band),
+        "surface": losses.surface_loss(on_surface, band),
         "free": losses.free_space_loss(sdf, target, is_free),
         # The paper's term on rendered depth, and the same likelihood on the samples themselves: a ray
-        # gives weight to the surface only, so that known free space would otherwise stay at its prior.
+        # gives weight to the surface only, so that known free space would otherwise stay at its prior. And on the
+        # readings, or sigma would not know how well they are met.
         "uncertainty": losses.uncertainty_loss((depth - observed) / band, variance, valid)
-        + losses.uncertainty_loss(sdf - target, sigma.square(), mask),
+        + losses.uncertainty_loss(sdf - target, sigma.square(), mask)
+        + losses.uncertainty_loss(on_surface, its_sigma.square(), torch.ones_like(on_surface, dtype=torch.bool)),
         "prior": losses.prior_loss(
             g.sigma[start : start + n_prior], settings.sigma_prior_m / band,
             torch.from_numpy(~field.visited(prior_points)),
