@@ -16,6 +16,8 @@ from active3d_pipe.structures import Frame
 MIN_SLOPE = 0.1  # rays that graze a surface by less than about 6 degrees are taken at this slope
 REDRAWS = 3
 GROUP = 16  # rays are drawn in groups of one frame: gathering costs by the frame
+SURFACE_GROUP = 64  # likewise readings, of which no neighbours are asked
+SPARE = 2  # pixels drawn for each, so that some may be without a reading
 NEIGHBOURS = ((0, 1), (0, -1), (1, 0), (-1, 0))
 
 
@@ -87,10 +89,19 @@ def surface_points(
     frames: Sequence[Frame], count: int, rng: np.random.Generator, weights: np.ndarray | None = None
 ) -> np.ndarray:
     """(N, 3) float32 world points at `count` readings, or fewer where there are none; arguments as of `sample_rays`."""
-    if count == 0:
-        return np.zeros((0, 3), np.float32)
-    batch = sample_rays(frames, count, rng, weights)
-    return points_on_rays(batch, batch.depth[:, None])[batch.valid]
+    p = None if weights is None else np.asarray(weights, dtype=np.float64) / np.sum(weights)
+    groups = rng.choice(len(frames), size=-(-count // SURFACE_GROUP), p=p)
+    parts = [np.zeros((0, 3), np.float32)]
+    for k, n in zip(*np.unique(groups, return_counts=True), strict=True):
+        frame, wanted = frames[k], n * SURFACE_GROUP
+        camera, T = frame.camera, frame.T_world_camera.astype(np.float32)
+        flat = rng.integers(0, frame.depth.size, SPARE * wanted)
+        depth = frame.depth.reshape(-1)[flat]
+        valid = np.flatnonzero((depth > 0) & (depth <= np.float32(camera.far)))[:wanted]
+        z, (i, j) = depth[valid], np.divmod(flat[valid], camera.width)
+        local = np.stack([(j + 0.5 - camera.cx) / camera.fx * z, (i + 0.5 - camera.cy) / camera.fy * z, z], axis=1)
+        parts.append(local.astype(np.float32) @ T[:3, :3].T + T[:3, 3])
+    return np.concatenate(parts)[:count]
 
 
 def _intrinsics(frame: Frame) -> tuple[float, float, float, float, float]:
