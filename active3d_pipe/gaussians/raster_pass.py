@@ -146,15 +146,6 @@ class RasterPass:
         """Number of primitives that the last `forward` projected onto a drawn image."""
         return int(self._state["visible"])
 
-    def visible(self) -> np.ndarray:
-        """(N,) bool, primitives that the last `forward` projected onto a drawn image."""
-        s = self._state
-        mask = np.zeros(len(s["values"]), bool)
-        for c in range(CHUNKS):
-            start = s["asked"] * c // CHUNKS
-            mask[s["ids"][start : start + s["counts"][c]]] = True
-        return mask
-
 
 def may_be_seen(
     values: np.ndarray, cameras: Sequence[Camera], poses: Sequence[np.ndarray], dilation_px2: float
