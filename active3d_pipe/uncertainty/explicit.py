@@ -171,7 +171,7 @@ def explicit_uncertainty(
     """
     before = np.zeros(grid.shape, np.float32) if previous is None else previous
     if not views:
-        return before
+        return before.copy()
     out = np.empty(grid.shape, np.float32)
     kernels.running_mean(
         *_summed(grid, views, settings), blur_taps(settings.residual_blur_voxels), np.float32(MIN_VIEWS),

@@ -81,7 +81,7 @@ def compute_volume(  # noqa: PLR0913  (the inputs of the stage, by name)
     last_u_exp = None if previous is None else previous["u_exp"]
     # Residuals lie at observed depths, never at phantoms, and their trilinear weights reach the voxels beside a
     # surface, which may prove to hold it; only what lies in the midst of free space is forgotten.
-    u_exp = explicit.explicit_uncertainty(grid, views, last_u_exp, settings).copy()
+    u_exp = explicit.explicit_uncertainty(grid, views, last_u_exp, settings)
     kernels.near_attention(terms.attention, u_exp)
 
     rows, targets = revealed_rows(grid, previous, fresh, predicted, settings)
