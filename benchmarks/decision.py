@@ -21,7 +21,7 @@ from run_folder import FinishedRun
 
 from active3d_pipe.gaussians import parameters
 from active3d_pipe.geometry.sampling import spread
-from active3d_pipe.planning import choice, decide, reward
+from active3d_pipe.planning import choice, decide, reward, walk
 from active3d_pipe.storage.files import read_json
 from active3d_pipe.structures import Camera, Decision
 from active3d_pipe.uncertainty import volume as volumes
@@ -46,9 +46,10 @@ PARTS = [
     (choice, "fine_positions", "candidates"),
     (choice, "sphere_rewards", "rewards of all views"),
     (choice, "exact_terms", "exact rewards of the best"),
-    (decide, "plan_path", "path"),
-    (decide, "_poses", "path"),
-    (decide, "_chain", "views that follow"),
+    (walk, "plan_path", "path"),
+    (walk, "_poses", "path"),
+    (walk, "_chain", "views that follow"),
+    (decide, "spread_field", "looks that surface is short of"),
     (decide, "expected_along", "account of the gain"),
     (decide, "account_terms", "account of the gain"),
 ]

@@ -26,6 +26,7 @@ from active3d_pipe.geometry import projection
 from active3d_pipe.information.entropy import bernoulli_entropy
 from active3d_pipe.information.gain import entropy_drop
 from active3d_pipe.planning import decide as decide_module
+from active3d_pipe.planning import walk as walk_module
 from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.decide import bootstrap_decision
 from active3d_pipe.planning.policies import base, trajectory
@@ -48,7 +49,7 @@ MODULES = {  # functions that decisions are made of -> name in the table of time
     "score": "candidates and reward", "reward_density": "path", "plan_path": "path",
     "looks_along": "looks along the path",
 }  # fmt: skip
-CALLERS = (decide_module, context_module, base, trajectory)  # modules of the package that call them by name
+CALLERS = (decide_module, walk_module, context_module, base, trajectory)  # modules that call them by name
 
 
 class CarvedWorld:

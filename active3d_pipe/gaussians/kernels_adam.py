@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from active3d_pipe.gaussians.kernels_projection import REACH
+from active3d_pipe.gaussians.kernels_projection import on_screen, screen_bound
 
 F = np.float32
 ZERO, ONE = F(0), F(1)
@@ -122,26 +122,16 @@ def near(
     given as in `project`; chunk c fills which[N c // chunks :][: counts[c]] with indices, ascending.
     """
     n = values.shape[0]
-    fx, fy, cx, cy, lim_x, lim_y = view[0], view[1], view[2], view[3], view[4], view[5]
-    width, height, nearest = view[6], view[7], view[8]
-    spread = REACH * max(fx, fy) * math.sqrt(ONE + lim_x * lim_x + lim_y * lim_y)
-    margin = REACH * math.sqrt(dilation)
+    spread, margin = screen_bound(view, dilation)
     for c in prange(chunks):
         first = n * c // chunks
         k = first
         for i in range(first, n * (c + 1) // chunks):
             missed = now - done[i]
             larger, astray = (LARGER, ASTRAY_M) if missed > 0 else (ONE, ZERO)
-            mx, my, mz = places[i, 0], places[i, 1], places[i, 2]
-            z = R[2, 0] * mx + R[2, 1] * my + R[2, 2] * mz + t[2]
-            if not z + astray > nearest:
-                continue
-            iz = ONE / max(z, nearest)
-            u = fx * (R[0, 0] * mx + R[0, 1] * my + R[0, 2] * mz + t[0]) * iz + cx
-            v = fy * (R[1, 0] * mx + R[1, 1] * my + R[1, 2] * mz + t[1]) * iz + cy
-            widest = larger * places[i, 3] + astray
-            bound = spread * widest * iz + margin
-            if not (u + bound > ZERO and u - bound < width and v + bound > ZERO and v - bound < height):
+            if not on_screen(
+                places[i, 0], places[i, 1], places[i, 2], larger * places[i, 3], astray, R, t, view, spread, margin
+            )[0]:
                 continue
             if missed > 0:
                 _go_on(values, moment1, moment2, steps, places, i, missed, rates, beta1, beta2)

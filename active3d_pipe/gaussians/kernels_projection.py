@@ -34,6 +34,33 @@ def _rotation(w, x, y, z):
     )
 
 
+@njit(fastmath=True, cache=True)
+def screen_bound(view, dilation):
+    """(spread, margin): no primitive is drawn farther than spread * standard deviation / z + margin pixels away."""
+    lim_x, lim_y = view[4], view[5]
+    spread = REACH * max(view[0], view[1]) * math.sqrt(ONE + lim_x * lim_x + lim_y * lim_y)
+    return spread, REACH * math.sqrt(dilation)
+
+
+@njit(fastmath=True, cache=True)
+def on_screen(mx, my, mz, widest, astray, R, t, view, spread, margin):
+    """(whether the view may show a primitive, z, x / z, y / z of its mean), camera frame.
+
+    `widest`: its largest standard deviation; `astray`: how far from (mx, my, mz) it may lie, m; the view as in
+    `project`, with its `screen_bound`. Where it may not be shown the last two are 0.
+    """
+    z = R[2, 0] * mx + R[2, 1] * my + R[2, 2] * mz + t[2]
+    if not z + astray > view[8]:
+        return False, z, ZERO, ZERO
+    iz = ONE / max(z, view[8])
+    xz = (R[0, 0] * mx + R[0, 1] * my + R[0, 2] * mz + t[0]) * iz
+    yz = (R[1, 0] * mx + R[1, 1] * my + R[1, 2] * mz + t[1]) * iz
+    u, v = view[0] * xz + view[2], view[1] * yz + view[3]
+    bound = spread * (widest + astray) * iz + margin
+    shown = u + bound > ZERO and u - bound < view[6] and v + bound > ZERO and v - bound < view[7]
+    return shown, z, xz, yz
+
+
 @njit(parallel=True, fastmath=True, cache=True)
 def project(values, which, R, t, view, tile_size, tile_grid, chunks, dilation, compensate, rec, ids, box, counts):
     """Write the records of the visible ones of `which` (L,) int32; chunk c fills rec[L c // chunks :][: counts[c]].
@@ -43,27 +70,22 @@ def project(values, which, R, t, view, tile_size, tile_grid, chunks, dilation, c
     """
     n = which.shape[0]
     fx, fy, cx, cy, lim_x, lim_y = view[0], view[1], view[2], view[3], view[4], view[5]
-    width, height, near = view[6], view[7], view[8]
+    width, height = view[6], view[7]
     tw, th = F(tile_size[0]), F(tile_size[1])
-    spread = REACH * max(fx, fy) * math.sqrt(ONE + lim_x * lim_x + lim_y * lim_y)
-    margin = REACH * math.sqrt(dilation)
+    spread, margin = screen_bound(view, dilation)
     for c in prange(chunks):
         k = n * c // chunks
         first = k
         for place in range(n * c // chunks, n * (c + 1) // chunks):
             i = which[place]
-            mx, my, mz = values[i, 0], values[i, 1], values[i, 2]
-            z = R[2, 0] * mx + R[2, 1] * my + R[2, 2] * mz + t[2]
-            if not z > near:
+            widest = math.exp(max(values[i, 3], max(values[i, 4], values[i, 5])))
+            shown, z, xz, yz = on_screen(
+                values[i, 0], values[i, 1], values[i, 2], widest, ZERO, R, t, view, spread, margin
+            )
+            if not shown:
                 continue
             iz = ONE / z
-            xz = (R[0, 0] * mx + R[0, 1] * my + R[0, 2] * mz + t[0]) * iz
-            yz = (R[1, 0] * mx + R[1, 1] * my + R[1, 2] * mz + t[1]) * iz
             u, v = fx * xz + cx, fy * yz + cy
-            widest = math.exp(max(values[i, 3], max(values[i, 4], values[i, 5])))
-            bound = spread * widest * iz + margin
-            if not (u + bound > ZERO and u - bound < width and v + bound > ZERO and v - bound < height):
-                continue
             opacity = ONE / (ONE + math.exp(-values[i, 10]))
             if opacity <= ALPHA_MIN:
                 continue
@@ -132,22 +154,16 @@ def may_be_seen(values, Rs, ts, views, chunks, dilation, out):
     `Rs` (V, 3, 3), `ts` (V, 3), `views` (V, 9) as in `project`, of V views.
     """
     n = values.shape[0]
-    margin = REACH * math.sqrt(dilation)
+    bounds = np.empty((len(views), 2), np.float32)
+    for v in range(len(views)):
+        bounds[v] = screen_bound(views[v], dilation)
     for c in prange(chunks):
         for i in range(n * c // chunks, n * (c + 1) // chunks):
             mx, my, mz = values[i, 0], values[i, 1], values[i, 2]
-            widest = REACH * math.exp(max(values[i, 3], max(values[i, 4], values[i, 5])))
+            widest = math.exp(max(values[i, 3], max(values[i, 4], values[i, 5])))
             seen = False
             for v in range(len(views)):
-                R, t = Rs[v], ts[v]
-                z = R[2, 0] * mx + R[2, 1] * my + R[2, 2] * mz + t[2]
-                if not z > views[v, 8]:
-                    continue
-                fx, fy, lim_x, lim_y = views[v, 0], views[v, 1], views[v, 4], views[v, 5]
-                bound = max(fx, fy) * math.sqrt(ONE + lim_x * lim_x + lim_y * lim_y) * widest / z + margin
-                x = fx * (R[0, 0] * mx + R[0, 1] * my + R[0, 2] * mz + t[0]) / z + views[v, 2]
-                y = fy * (R[1, 0] * mx + R[1, 1] * my + R[1, 2] * mz + t[1]) / z + views[v, 3]
-                if x + bound > ZERO and x - bound < views[v, 6] and y + bound > ZERO and y - bound < views[v, 7]:
+                if on_screen(mx, my, mz, widest, ZERO, Rs[v], ts[v], views[v], bounds[v, 0], bounds[v, 1])[0]:
                     seen = True
                     break
             out[i] = seen

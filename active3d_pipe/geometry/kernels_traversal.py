@@ -7,7 +7,7 @@ Flat voxel ids are C order: (i * ny + j) * nz + k.
 """
 
 import numpy as np
-from numba import njit
+from numba import njit, prange
 
 # Stands for infinity: fastmath kernels must not meet a real one.
 FAR = np.float32(1e30)
@@ -175,11 +175,12 @@ def first_hits(opaque, origin, directions, t_end, shape, out_t):
         out_t[r] = max(t, np.float32(1e-6))
 
 
-@njit(fastmath=True, cache=True)
-def first_voxels(opaque, origin, directions, t_end, shape, out_id):
-    """`first_voxel` of each ray of a fan."""
+@njit(parallel=True, fastmath=True, cache=True)
+def first_voxels(opaque, origins, directions, t_end, shape, out_id):
+    """`first_voxel` of each ray of fans of their own: origins (P, 3), directions (P, M, 3), out_id (P, M)."""
     nx, ny, nz = shape
-    ids = np.empty(nx + ny + nz + 3, np.int32)
-    for r in range(directions.shape[0]):
-        dx, dy, dz = directions[r, 0], directions[r, 1], directions[r, 2]
-        out_id[r] = first_voxel(opaque, origin, dx, dy, dz, t_end, nx, ny, nz, ids)
+    for p in prange(origins.shape[0]):
+        ids = np.empty(nx + ny + nz + 3, np.int32)
+        for r in range(directions.shape[1]):
+            dx, dy, dz = directions[p, r, 0], directions[p, r, 1], directions[p, r, 2]
+            out_id[p, r] = first_voxel(opaque, origins[p], dx, dy, dz, t_end, nx, ny, nz, ids)

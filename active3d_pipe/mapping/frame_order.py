@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from active3d_pipe.geometry import kernels_traversal as kernels
-from active3d_pipe.geometry.voxel_traversal import carve, ray_fan, to_voxel_units
+from active3d_pipe.geometry.random_looks import random_looks, ray_ends
+from active3d_pipe.geometry.voxel_traversal import carve, ray_fan
 from active3d_pipe.mapping.keyframes import depth_samples
 from active3d_pipe.structures import Frame, VoxelGrid
 
@@ -35,10 +35,14 @@ def exposure(frames: Sequence[Frame], rng: np.random.Generator) -> np.ndarray:
     opaque = ((free == 0) | (hit > 0)).view(np.uint8).ravel()  # a look ends at what is not known
     surface, shown = hit.ravel() > 0, []
     for frame in frames:
-        ends = _ends(grid, opaque, frame.T_world_camera, ray_fan(frame.camera, READING_STRIDE)[2], frame.camera.far)
+        T, fan = frame.T_world_camera, ray_fan(frame.camera, READING_STRIDE)[2]
+        ends = ray_ends(grid, opaque, T[None, :3, 3], (fan @ T[:3, :3].T)[None], frame.camera.far)
         shown.append(ends[surface[ends]])
     by_frames = np.bincount(np.concatenate(shown), minlength=grid.size)
-    by_looks = np.bincount(_random_looks(grid, opaque, rng), minlength=grid.size) * (by_frames > 0)
+    clearance = distance_transform_edt(opaque.reshape(grid.shape) == 0, sampling=grid.voxel_size)
+    places, longest = np.argwhere(clearance >= CLEARANCE_M), float(np.linalg.norm(grid.high - grid.low))
+    by_looks = np.bincount(random_looks(grid, opaque, places, PLACES, GLANCES, longest, rng), minlength=grid.size)
+    by_looks *= by_frames > 0
     if not by_looks.any():
         return np.ones(len(frames))
     # One look more in every cell, of either kind: few looks say little.
@@ -73,29 +77,3 @@ def _grid_around(frames: Sequence[Frame]) -> VoxelGrid | None:
     low, high = np.min([p.min(0) for p in points if len(p)], 0), np.max([p.max(0) for p in points if len(p)], 0)
     edge = max(CELL_M, float(np.prod(high - low + CELL_M) / MOST_CELLS) ** (1 / 3))
     return VoxelGrid.from_bounds(low - edge / 2, high + edge / 2, edge)
-
-
-def _random_looks(grid: VoxelGrid, opaque: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """(N,) cells in which rays of random directions from random places of the free space end."""
-    distance = distance_transform_edt(opaque.reshape(grid.shape) == 0, sampling=grid.voxel_size)
-    places = np.argwhere(distance >= CLEARANCE_M)
-    if not len(places):
-        return np.zeros(0, np.int64)
-    longest, ends = float(np.linalg.norm(grid.high - grid.low)), []
-    for place in places[rng.integers(0, len(places), PLACES)]:
-        T = np.eye(4)
-        T[:3, 3] = grid.centre_of(place)
-        directions = rng.normal(size=(GLANCES, 3))
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        ends.append(_ends(grid, opaque, T, directions, longest))
-    return np.concatenate(ends)
-
-
-def _ends(
-    grid: VoxelGrid, opaque: np.ndarray, T_world_camera: np.ndarray, directions: np.ndarray, reach_m: float
-) -> np.ndarray:
-    """(N,) flat ids of the cells in which rays end, of those (M, 3) in the camera frame that end in one."""
-    origin, rays = to_voxel_units(grid, T_world_camera, directions)
-    ids = np.zeros(len(rays), np.int64)
-    kernels.first_voxels(opaque, origin, rays, np.float32(reach_m), grid.shape, ids)
-    return ids[ids >= 0]

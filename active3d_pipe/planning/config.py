@@ -63,6 +63,10 @@ class PlanningSettings(Settings):
         4, ge=1, description="before it stops, the search is repeated with this many times the positions, targets and "
         "exactly scored views"
     )
+    spread_share: float = Field(
+        1.0, ge=0, description="once nothing new is left to see, the walk goes on for this share of the steps so far, "
+        "to where surface was looked at less than random views would look at it; 0 = stop at once"
+    )
     hidden_reward: float = Field(
         30.0, ge=0, description="once the best view promises less than this, unseen space is searched for what few "
         "places can see; 0 = only before the stop"

@@ -19,6 +19,7 @@ class Reason(StrEnum):
     RELAXED = "relaxed_clearance"  # reachable only with reduced clearance
     BACKTRACK = "backtrack"  # nothing reachable; go back along the walked path
     LOOK_AROUND = "look_around"  # cannot move; turn on the spot
+    SPREAD = "spread_views"  # nothing new is left to see; where surface was looked at too little
     STOP_GAIN = "stop_gain"  # best expected gain below the threshold
     STOP_STUCK = "stop_stuck"  # no reachable goal at all
     STOP_BUDGET = "stop_budget"  # step budget spent

@@ -90,11 +90,12 @@ def test_first_voxels_are_where_the_reference_stops():
     opaque[3, 2, 2] = False
     directions = rng.normal(size=(200, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    found = np.zeros(len(directions), np.int64)
+    found = np.zeros((1, len(directions)), np.int64)
     kernels.first_voxels(
-        opaque.view(np.uint8).ravel(), origin.astype(np.float32), directions.astype(np.float32), np.float32(3.0), SHAPE,
-        found,
+        opaque.view(np.uint8).ravel(), origin.astype(np.float32)[None], directions.astype(np.float32)[None],
+        np.float32(3.0), SHAPE, found,
     )
+    found = found[0]
     paths = [reference.traverse(opaque, origin, d, 3.0) for d in directions]
     wanted = [np.ravel_multi_index(path[-1], SHAPE) if opaque[path[-1]] else -1 for path in paths]
     assert np.count_nonzero(found != wanted) <= 2  # rays through an edge may pass on either side

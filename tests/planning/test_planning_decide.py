@@ -47,7 +47,9 @@ def check_motion(world, walked, motion):
 def test_two_rooms_are_explored_without_touching_anything_and_then_it_stops():
     world = box_world.two_rooms()
     target, _ = box_world.reachable_surface(world, START)
-    settings = PlanningSettings(stop_reward=40.0, max_positions=250, exact_top=20, rrt_iterations=300)
+    settings = PlanningSettings(
+        stop_reward=40.0, spread_share=0, max_positions=250, exact_top=20, rrt_iterations=300
+    )
     walked, decisions, curve = explore(world, START, budget=420, target=target, settings=settings)
     assert decisions[-1].reason is Reason.STOP_GAIN
     assert curve[-1] >= 0.96
@@ -68,7 +70,7 @@ def test_a_ground_robot_keeps_its_height():
     world = box_world.build((3.0, 2.6, 2.0), [((1.2, 0.9, 0), (1.8, 1.5, 0.9))])
     motion = MotionSettings(model="ground")
     walked, decisions, _ = explore(
-        world, (0.6, 0.6, 1.0), budget=150, motion=motion, settings=PlanningSettings(stop_reward=30.0)
+        world, (0.6, 0.6, 1.0), budget=150, motion=motion, settings=PlanningSettings(stop_reward=30.0, spread_share=0.2)
     )
     np.testing.assert_array_equal(walked[:, 2, 3], 1.0)
     check_motion(world, walked, motion)
@@ -124,9 +126,32 @@ def test_it_goes_on_to_a_goal_it_did_not_reach(after_first_look):
 
 def test_it_stops_when_nothing_is_left_to_gain(after_first_look):
     world, walked, _ = after_first_look
-    d = take(world, walked, settings=PlanningSettings(stop_reward=1e6))
+    d = take(world, walked, settings=PlanningSettings(stop_reward=1e6, spread_share=0))
     assert d.stop and d.reason is Reason.STOP_GAIN and len(d.path) == 0
     assert 0 < d.terms["best_reward"] < 1e6
+
+
+def test_before_it_stops_it_spreads_its_views_for_a_share_of_the_steps(after_first_look):
+    """From the first turn some surface was looked at often, some hardly; nothing new counts here."""
+    world, walked, first = after_first_look
+    settings = PlanningSettings(stop_reward=1e6, spread_share=0.6, max_steps_per_round=12)
+    previous, decisions = first, []
+    while not previous.stop:
+        previous = take(world, walked, settings=settings, previous=previous)
+        walked = np.concatenate([walked, previous.path])
+        decisions.append(previous)
+        for T in previous.path:
+            world.capture(T)
+    *spread, last = decisions
+    assert all(d.reason is Reason.SPREAD and len(d.path) > 0 for d in spread)
+    assert last.reason is Reason.STOP_GAIN
+    steps = np.cumsum([len(d.path) for d in spread])
+    assert [d.terms["spread_steps"] for d in spread] == steps.tolist()
+    explored = len(first.path) + 1  # the pose where the agent stands counts once more
+    assert steps[-2] < 0.6 * explored <= steps[-1]
+    assert spread[-1].terms["spread_shortfall"] < spread[0].terms["spread_shortfall"]
+    assert {d.terms["stop_reward"] for d in decisions} == {1e6}
+    check_motion(world, walked, MOTION)
 
 
 def test_a_walled_in_agent_looks_around_goes_back_and_stops():

@@ -6,6 +6,7 @@ from uncertainty_room import CAMERA, SIZE, frame, frames, pose, room_grid, trace
 
 from active3d_pipe.geometry import projection, se3, voxel_traversal
 from active3d_pipe.structures import Camera, Frame, VoxelGrid
+from active3d_pipe.uncertainty import kernels_carving
 from active3d_pipe.uncertainty.carving import integrate_depth, looks_in_vain
 from active3d_pipe.uncertainty.config import UncertaintySettings
 
@@ -175,6 +176,33 @@ def test_counts_only_grow_add_up_and_do_not_depend_on_order():
         np.testing.assert_array_equal(getattr(both, name), getattr(joined, name))
         assert (getattr(both, name) >= getattr(first, name)).all()
         assert getattr(integrate_depth(grid, fs[::-1], s), name).tobytes() == getattr(both, name).tobytes()
+
+
+def random_evidence(rng, shape, dtype):
+    """Free and hit counts, quality, and bits of two kinds; nothing at all in half of the voxels."""
+    seen = rng.random(shape) < 0.5
+    counts = [(rng.integers(0, 4, shape) * seen).astype(dtype) for _ in range(2)]
+    quality = (rng.random(shape) * (counts[1] > 0)).astype(np.float32)
+    bits = [(rng.integers(0, 256, shape) * seen).astype(np.uint8) for _ in range(2)]
+    return [*counts, quality, *bits]
+
+
+def test_chunks_are_gathered_and_evidence_is_joined_as_numpy_does_it():
+    rng = np.random.default_rng(3)
+    shape = (7, 5, 6)
+    chunks = random_evidence(rng, (4, *shape), np.int32)
+    got = [np.zeros(shape, a.dtype) for a in random_evidence(rng, shape, np.float32)]
+    kernels_carving.gather(*chunks, *got)
+    ways = (np.sum, np.sum, np.max, np.bitwise_or.reduce, np.bitwise_or.reduce)
+    gathered = [way(a, axis=0) for way, a in zip(ways, chunks, strict=True)]
+    for a, expected in zip(got, gathered, strict=True):
+        np.testing.assert_array_equal(a, expected)
+
+    newer, got = random_evidence(rng, shape, np.float32), [a.copy() for a in got]
+    kernels_carving.join(*newer, *got)
+    joins = (np.add, np.add, np.maximum, np.bitwise_or, np.bitwise_or)
+    for a, join, old, new in zip(got, joins, gathered, newer, strict=True):
+        np.testing.assert_array_equal(a, join(old, new))
 
 
 def test_frames_of_several_cameras_mix():
