@@ -9,7 +9,13 @@ import numpy as np
 
 from active3d_pipe.geometry.voxel_traversal import fan_stride
 from active3d_pipe.information.gain import GainTerms
-from active3d_pipe.planning.candidates import Directions, coarse_positions, fine_positions, view_directions
+from active3d_pipe.planning.candidates import (
+    NUM_ELEVATIONS,
+    Directions,
+    coarse_positions,
+    fine_positions,
+    view_directions,
+)
 from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.free_space import FreeSpace
 from active3d_pipe.planning.kernels_candidates import spread_values
@@ -21,6 +27,10 @@ from active3d_pipe.structures.motion import MotionSettings
 
 # Of the short list a fan of rays that is so many times coarser says which may lead; only those get the dense one.
 GLANCE = 2
+# Times `hidden_reward` from which a glance at the largest reward is sure enough that it will not fall below it.
+PLENTY = 3
+# Rows of rays of the first estimate of all places, half as dense each way as that of its leaders.
+FEW_ELEVATIONS = NUM_ELEVATIONS // 2
 # Where hidden space was searched: how many positions for each exactly scored view are estimated a second time, and the
 # rows of rays they are estimated with.
 SECOND_LOOKS, FINE_ELEVATIONS = 4, 48
@@ -128,7 +138,10 @@ def score(  # noqa: PLR0913  (what a decision knows, by name)
     glance = GLANCE * fan_stride(camera, space.grid.voxel_size, field.max_range_m)
     terms = exact_terms(field, poses, camera, glance)
     by_reward = np.array([t.reward for t in terms])
-    leaders = [np.argsort(-ranking, kind="stable")[: settings.exact_top // 4] for ranking in (ranked(terms), by_reward)]
+    # Those that lead by reward say whether anything is left to see: far from that, a glance at them is enough.
+    plenty = by_reward.max(initial=0) > PLENTY * settings.hidden_reward
+    rankings = (ranked(terms),) if plenty else (ranked(terms), by_reward)
+    leaders = [np.argsort(-ranking, kind="stable")[: settings.exact_top // 4] for ranking in rankings]
     again = np.union1d(np.concatenate(leaders), np.flatnonzero(committed))
     for i, exact in zip(again.tolist(), exact_terms(field, poses[again], camera), strict=True):
         terms[i] = exact
@@ -166,7 +179,11 @@ def _estimate(  # noqa: PLR0913  (what `score` knows, and the directions)
     seeing = target_positions(space, field, motion, settings)
     hidden = [hidden_positions(space, field, motion, settings, hidden_pairs, turn) for turn in turns]
     voxels = np.unique(np.concatenate([space.start[None], coarse_positions(space, settings), seeing, *hidden]), axis=0)
-    rewards, utility = estimates(voxels, directions)
+    few = view_directions(camera, settings.num_yaws, settings.pitches_deg, FEW_ELEVATIONS)
+    rewards, utility = estimates(voxels, directions if turns else few)
+    if not turns:
+        again = _worth_another_look(rewards, utility, SECOND_LOOKS * settings.exact_top)
+        rewards[again], utility[again] = estimates(voxels[again], directions)
     top = np.argsort(-utility.max(axis=1), kind="stable")[: settings.refine_top]
     fine = fine_positions(space, voxels[top], settings)
     fine = fine[~(fine[:, None] == voxels[None]).all(axis=-1).any(axis=1)]

@@ -165,7 +165,7 @@ def _open_escape(
     centres = np.stack(np.meshgrid(*(grid.axis(i)[box[i]] for i in range(3)), indexing="ij"), axis=-1)
     near = np.linalg.norm(centres - position, axis=-1) <= settings.escape_m
     away = kernels.distance_transform(solid.view(np.uint8), int(required / grid.voxel_size) + 2, False)[box]
-    safe = (np.sqrt(away) - 0.5) * grid.voxel_size >= required - 1e-6
+    safe = (np.sqrt(away, dtype=np.float64) - 0.5) * grid.voxel_size >= required - 1e-6
     passable[box] |= near & safe & (clear[box] >= escape - 1e-6)
     checked = clear.copy()
     checked[box] = np.where(near & ~safe & (clear[box] < required - 1e-6), 0, clear[box])

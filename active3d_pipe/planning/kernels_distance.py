@@ -8,7 +8,6 @@ from numba import njit, prange
 
 FAR = np.float32(1e30)
 LOW = np.uint64(0xFFFFFFFF)
-LINE = 16  # int32 in a cache line
 ALL_ROWS = (1 << 27) - 1
 ALL_BUT_OLDEST = sum(0b110 << 3 * row for row in range(9))
 ALL_MOVES = ALL_ROWS & ~(1 << 13)
@@ -29,59 +28,49 @@ def _scan_line(line, out, n, reach):
 
 
 @njit(cache=True)
-def _combine(line, out, n, reach, chebyshev):
-    """Minimum over offsets r of line[i +- r] joined with r: d2 + r^2, or max(d, r) for the Chebyshev metric."""
-    for i in range(n):
-        best = line[i]
-        for r in range(1, reach + 1):
-            floor = r if chebyshev else r * r
-            if floor >= best:
-                break
-            if i - r >= 0:
-                d = max(line[i - r], r) if chebyshev else line[i - r] + floor
-                best = min(best, d)
-            if i + r < n:
-                d = max(line[i + r], r) if chebyshev else line[i + r] + floor
-                best = min(best, d)
-        out[i] = best
+def _nearer(row, beside, step, chebyshev):
+    """row = min(row, distance by way of `beside`, which lies `step` away): max(d, step), or d + step of squares."""
+    if chebyshev:
+        for k in range(row.size):
+            row[k] = min(row[k], max(beside[k], step))
+    else:
+        for k in range(row.size):
+            row[k] = min(row[k], np.int16(beside[k] + step))
 
 
 @njit(parallel=True, cache=True)
 def distance_transform(source, reach, chebyshev):
     """Distance, in voxels, from every voxel to the nearest non-zero one of `source` (uint8 [X, Y, Z]).
 
-    Euclidean: squared, at most reach^2. Chebyshev: at most `reach`. int32. What lies outside the grid counts
-    as nothing. Separable, one pass an axis.
+    Euclidean: squared, at most reach^2. Chebyshev: at most `reach`, which is 127 or less. int16. What lies outside
+    the grid counts as nothing. Separable, one pass an axis, over whole planes of rows along z: the processor takes
+    many voxels at a time.
     """
     nx, ny, nz = source.shape
-    d = np.empty((nx, ny, nz), np.int32)
+    along_z, along_yz = np.empty((nx, ny, nz), np.int16), np.empty((nx, ny, nz), np.int16)
+    steps = np.empty(reach + 1, np.int16)
+    for r in range(reach + 1):
+        steps[r] = r if chebyshev else r * r
+    plane = ny * nz
     for i in prange(nx):
-        a, b = np.empty(max(ny, nz), np.int32), np.empty(max(ny, nz), np.int32)
+        line = np.empty(nz, np.int32)
         for j in range(ny):
-            _scan_line(source[i, j], a, nz, reach)
+            _scan_line(source[i, j], line, nz, reach)
             for k in range(nz):
-                d[i, j, k] = a[k] if chebyshev else a[k] * a[k]
-        for k in range(nz):
-            for j in range(ny):
-                a[j] = d[i, j, k]
-            _combine(a, b, ny, reach, chebyshev)
-            for j in range(ny):
-                d[i, j, k] = b[j]
-    for j in prange(ny):
-        # Lines along x lie far apart in memory: taken by the cache line.
-        lines, b = np.empty((LINE, nx), np.int32), np.empty(nx, np.int32)
-        for first in range(0, nz, LINE):
-            count = min(LINE, nz - first)
-            for i in range(nx):
-                for m in range(count):
-                    lines[m, i] = d[i, j, first + m]
-            for m in range(count):
-                _combine(lines[m], b, nx, reach, chebyshev)
-                lines[m] = b
-            for i in range(nx):
-                for m in range(count):
-                    d[i, j, first + m] = lines[m, i]
-    return d
+                along_z[i, j, k] = line[k] if chebyshev else line[k] * line[k]
+        here, out = along_z[i].ravel(), along_yz[i].ravel()
+        out[:] = here
+        for r in range(1, min(reach + 1, ny)):
+            _nearer(out[r * nz :], here[: plane - r * nz], steps[r], chebyshev)
+            _nearer(out[: plane - r * nz], here[r * nz :], steps[r], chebyshev)
+    found = along_z
+    for i in prange(nx):
+        out = found[i].ravel()
+        out[:] = along_yz[i].ravel()
+        for other in range(max(i - reach, 0), min(i + reach + 1, nx)):
+            if other != i:
+                _nearer(out, along_yz[other].ravel(), steps[abs(other - i)], chebyshev)
+    return found
 
 
 @njit(inline="always")

@@ -87,7 +87,7 @@ def frustum_gain(
     """Exact sums over the unique visible voxels of every candidate view.
 
     origins (C, 3), rotations (C, 3, 3) camera to world, fan (M, 3) unit camera rays. A voxel counts at the first
-    ray of the fan that crosses it, with that ray's transmittance; stamps keep it from counting twice, and so for open
+    ray of the fan that crosses it, with that ray's transmittance; marks keep it from counting twice, and so for open
     cells. Returns (C, 6) float64: reward, surface part, gain_imp, gain_exp, number visible (seen free ones do not
     count), number open.
     """
@@ -96,10 +96,11 @@ def frustum_gain(
     out = np.zeros((count, 6), np.float64)
     chunks = min(4, count)
     for chunk in prange(chunks):
-        stamp = np.full(size, -1, np.int32)
-        cells = np.zeros(size, np.uint8)
+        # Small marks that are taken back after every view: a volume of numbers of views is four times as much memory.
+        seen, cells, met = np.zeros(size, np.uint8), np.zeros(size, np.uint8), np.empty(size, np.int32)
         ids = np.empty(shape[0] + shape[1] + shape[2] + 3, np.int32)
         for c in range(chunk, count, chunks):
+            num_met = 0
             for r in range(fan.shape[0]):
                 n, bit, (dx, dy, dz), piece = cast(
                     opaque, clear, skip, origins[c], rotations[c], fan[r], voxel_size, max_range, shape, ids
@@ -109,9 +110,10 @@ def frustum_gain(
                     v = ids[m]
                     if kind[v] == 0:
                         continue
-                    if stamp[v] != c:
-                        stamp[v] = c
-                        cells[v] = 0
+                    if not seen[v]:
+                        seen[v] = 1
+                        met[num_met] = v
+                        num_met += 1
                         out[c, 4] += transmittance
                         if kind[v] == 1:
                             out[c, 0] += transmittance * value[v]
@@ -142,6 +144,8 @@ def frustum_gain(
                         transmittance = np.exp(depth)
                         if transmittance < LEAST_TRANSMITTANCE:
                             break
+            for m in range(num_met):
+                seen[met[m]] = cells[met[m]] = 0
     return out
 
 
@@ -215,9 +219,11 @@ def count_looks(
     size, count, chunks = shape[0] * shape[1] * shape[2], origins.shape[0], 2
     looks = np.zeros((chunks, 2, size), np.float32)
     for chunk in prange(chunks):
-        stamp, cell_stamp = np.full(size, -1, np.int32), np.full(size, -1, np.int32)
+        # 1: the voxel counted for this view, 2: its open cells did.
+        mark, met = np.zeros(size, np.uint8), np.empty(size, np.int32)
         ids = np.empty(shape[0] + shape[1] + shape[2] + 3, np.int32)
         for c in range(chunk, count, chunks):
+            num_met = 0
             for r in range(fan.shape[0]):
                 n, bit, (dx, dy, dz), _ = cast(
                     stops, clear, skip, origins[c], rotations[c], fan[r], voxel_size, max_range, shape, ids
@@ -226,7 +232,8 @@ def count_looks(
                     v = ids[m]
                     if kind[v] == 0:
                         continue
-                    if stamp[v] != c:
+                    before = mark[v]
+                    if not mark[v] & 1:
                         promised = kind[v] == 1 and stops[v] == 0
                         if kind[v] == 2:
                             t = distance_to(origins[c], v, shape, voxel_size)
@@ -235,11 +242,20 @@ def count_looks(
                             )
                             promised = share > np.float32(0.5) * (ONE - quality[v] / enough)
                         if promised:
-                            stamp[v] = c
+                            mark[v] |= 1
                             looks[chunk, 0, v] += weights[c]
-                    if kind[v] == 2 and open_bits[v] & bit and cell_stamp[v] != c:
+                    if kind[v] == 2 and open_bits[v] & bit and not mark[v] & 2:
                         t = distance_to(origins[c], v, shape, voxel_size)
                         if cell_share(t, enough, quality_range) >= ONE:
-                            cell_stamp[v] = c
+                            mark[v] |= 2
                             looks[chunk, 1, v] += weights[c]
-    return looks[0] + looks[1]
+                    if before == 0 and mark[v]:
+                        met[num_met] = v
+                        num_met += 1
+            for m in range(num_met):
+                mark[met[m]] = 0
+    for chunk in range(1, chunks):
+        for kind_of_look in range(2):
+            for v in prange(size):
+                looks[0, kind_of_look, v] += looks[chunk, kind_of_look, v]
+    return looks[0]
