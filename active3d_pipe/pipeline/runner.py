@@ -132,8 +132,8 @@ class Runner:
 
     def last_round(self) -> int:
         """The round where the loop ends as far as the disk tells, else the first that is not whole."""
-        k = 0
-        while k <= self.surveyor.last_round_on_disk():
+        k, on_disk = 0, self.surveyor.last_round_on_disk()
+        while k <= on_disk:
             if any(self._record(node) is None for node in self.registry.round_nodes(k)):
                 return k
             if self.ended(k):
