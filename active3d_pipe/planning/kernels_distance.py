@@ -35,22 +35,28 @@ def _nearer(row, beside, step, chebyshev):
             row[k] = min(row[k], max(beside[k], step))
     else:
         for k in range(row.size):
-            row[k] = min(row[k], np.int16(beside[k] + step))
+            row[k] = min(row[k], row.dtype.type(beside[k] + step))
 
 
-@njit(parallel=True, cache=True)
 def distance_transform(source, reach, chebyshev):
     """Distance, in voxels, from every voxel to the nearest non-zero one of `source` (uint8 [X, Y, Z]).
 
-    Euclidean: squared, at most reach^2. Chebyshev: at most `reach`, which is 127 or less. int16. What lies outside
-    the grid counts as nothing. Separable, one pass an axis, over whole planes of rows along z: the processor takes
-    many voxels at a time.
+    Euclidean: squared, at most reach^2. Chebyshev: at most `reach`. int16, or int32 where two squares of the reach
+    would not fit. What lies outside the grid counts as nothing. Separable, one pass an axis, over whole planes of rows
+    along z: the processor takes many voxels at a time.
     """
+    dtype = np.int16 if 2 * reach * reach < 1 << 15 else np.int32
+    steps = np.arange(reach + 1, dtype=dtype)
+    along_z, along_yz = np.empty(source.shape, dtype), np.empty(source.shape, dtype)
+    _distance_transform(source, steps if chebyshev else steps * steps, chebyshev, along_z, along_yz)
+    return along_z
+
+
+@njit(parallel=True, cache=True)
+def _distance_transform(source, steps, chebyshev, along_z, along_yz):
+    """`distance_transform` into `along_z`; `steps` (reach + 1,) what so many voxels along one axis are worth."""
     nx, ny, nz = source.shape
-    along_z, along_yz = np.empty((nx, ny, nz), np.int16), np.empty((nx, ny, nz), np.int16)
-    steps = np.empty(reach + 1, np.int16)
-    for r in range(reach + 1):
-        steps[r] = r if chebyshev else r * r
+    reach = len(steps) - 1
     plane = ny * nz
     for i in prange(nx):
         line = np.empty(nz, np.int32)
@@ -63,14 +69,12 @@ def distance_transform(source, reach, chebyshev):
         for r in range(1, min(reach + 1, ny)):
             _nearer(out[r * nz :], here[: plane - r * nz], steps[r], chebyshev)
             _nearer(out[: plane - r * nz], here[r * nz :], steps[r], chebyshev)
-    found = along_z
     for i in prange(nx):
-        out = found[i].ravel()
+        out = along_z[i].ravel()
         out[:] = along_yz[i].ravel()
         for other in range(max(i - reach, 0), min(i + reach + 1, nx)):
             if other != i:
                 _nearer(out, along_yz[other].ravel(), steps[abs(other - i)], chebyshev)
-    return found
 
 
 @njit(inline="always")

@@ -133,6 +133,18 @@ def test_distance_transforms_equal_scipy():
     np.testing.assert_array_equal(chess, np.minimum(distance_transform_cdt(source == 0, "chessboard"), 5))
 
 
+@pytest.mark.parametrize("reach", [127, 128, 300])
+def test_far_distances_do_not_overflow(reach):
+    """Two squares of the reach fit int16 up to 127."""
+    source = np.zeros((320, 3, 260), np.uint8)
+    source[0, 1, 0] = 1
+    squared = kernels_distance.distance_transform(source, reach, False)
+    assert squared.max() == reach**2
+    np.testing.assert_array_equal(squared, np.minimum(np.round(distance_transform_edt(source == 0) ** 2), reach**2))
+    chess = kernels_distance.distance_transform(source, reach, True)
+    np.testing.assert_array_equal(chess, np.minimum(distance_transform_cdt(source == 0, "chessboard"), reach))
+
+
 def test_spread_poses_are_distinct_and_start_with_the_newest():
     poses = np.stack([se3.pose_from_yaw_pitch(np.array([0.1 * i, 0, 0]), 0.0, 0.0) for i in range(30)])
     chosen = spread_poses(poses, 4)
