@@ -27,7 +27,7 @@ from active3d_pipe.structures.motion import MotionSettings
 
 # Of the short list a fan of rays that is so many times coarser says which may lead; only those get the dense one.
 GLANCE = 2
-# Times `hidden_reward` from which a glance at the largest reward is sure enough that it will not fall below it.
+# Times `hidden_reward` and `stop_reward` from which a glance at the largest reward says surely that it is above them.
 PLENTY = 3
 # Rows of rays of the first estimate of all places, half as dense each way as that of its leaders.
 FEW_ELEVATIONS = NUM_ELEVATIONS // 2
@@ -139,7 +139,7 @@ def score(  # noqa: PLR0913  (what a decision knows, by name)
     terms = exact_terms(field, poses, camera, glance)
     by_reward = np.array([t.reward for t in terms])
     # Those that lead by reward say whether anything is left to see: far from that, a glance at them is enough.
-    plenty = by_reward.max(initial=0) > PLENTY * settings.hidden_reward
+    plenty = by_reward.max(initial=0) > PLENTY * max(settings.hidden_reward, settings.stop_reward)
     rankings = (ranked(terms),) if plenty else (ranked(terms), by_reward)
     leaders = [np.argsort(-ranking, kind="stable")[: settings.exact_top // 4] for ranking in rankings]
     again = np.union1d(np.concatenate(leaders), np.flatnonzero(committed))
