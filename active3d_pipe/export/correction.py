@@ -19,6 +19,7 @@ SURE = 3.0  # standard errors that it must lie off the surface
 SCATTER_M = 0.12  # within which noise shows on both sides of a surface
 BY_NOISE = 5.0  # standard deviations of the sensor's noise up to which it may explain a contradiction
 OTHER_SIDE = 0.2  # share of such a contradiction that may lie on the other side of the surface
+NOISE_FRAMES = 100  # evenly spread, that say what the sensor's noise is
 NOISE_STRIDE = 16  # rows of an image, every how many say what the sensor's noise is
 FROM_MEDIAN = 1 / (0.6745 * 6**0.5)  # standard deviation of a reading by the median of |a - 2 b + c|
 MOST_READINGS = 16  # in a cell, after which further frames are not asked about it
@@ -53,7 +54,7 @@ def corrected_sdf(
         list(pool.map(np.copyto, depths, [f.depth for f in fused]))
     views = (
         depths, np.ascontiguousarray(poses[:, :3, :3]),
-        np.ascontiguousarray(poses[:, :3, 3]), lenses,
+        np.ascontiguousarray(poses[:, :3, 3]), lenses, np.array([f.depth.max() for f in fused], np.float32),
     )
     near = np.float32(min(f.camera.near for f in fused))
     truncation = np.float32(settings.fusion_truncation_cells * settings.voxel_size_m)
@@ -83,7 +84,7 @@ def _disputed(
     sums, below, squares, noises = (np.zeros(grid.shape, np.float32) for _ in range(4))
     counts = np.zeros(grid.shape, np.int32)
     compared = spread(frames, MOST_FRAMES)
-    sensor = sensor_noise(compared)
+    sensor = sensor_noise(spread(compared, NOISE_FRAMES))
     against = np.zeros(len(compared), np.int64)
     for index in _scattered(len(compared)):
         frame = compared[index]

@@ -7,6 +7,11 @@
 import numpy as np
 from numba import njit, prange
 
+from active3d_pipe.export.kernels_views import bounding_sphere, flat_cell, meets_frustum, to_cells
+
+CHUNK = 256  # neighbouring points, of which a frame whose frustum misses them all is not asked
+SLACK = np.float32(1.001)  # times the radius of a chunk, for rounding
+
 
 @njit(cache=True)
 def open_readings(rotation, centre, lens, depth, stride, reach, origin, inv_cell, counts, most, points):
@@ -14,21 +19,22 @@ def open_readings(rotation, centre, lens, depth, stride, reach, origin, inv_cell
 
     reach: (near, far), m, between which a reading counts. Into points (N, 3) f32; returns how many.
     """
-    nx, ny, nz = counts.shape
     height, width = depth.shape
-    count = 0
+    turn, shift = to_cells(rotation, centre, origin, inv_cell)
+    flat, half, count = counts.reshape(-1), np.float32(0.5), 0
+    inv_x, inv_y = np.float32(1) / lens[0], np.float32(1) / lens[1]
     for i in range(stride // 2, height, stride):
+        y = (np.float32(i) + half - lens[3]) * inv_y
         for j in range(stride // 2, width, stride):
             d = depth[i, j]
             if not (d > reach[0] and d < reach[1]):
                 continue
-            x, y = (j + np.float32(0.5) - lens[2]) / lens[0] * d, (i + np.float32(0.5) - lens[3]) / lens[1] * d
-            for c in range(3):
-                points[count, c] = rotation[c, 0] * x + rotation[c, 1] * y + rotation[c, 2] * d + centre[c]
-            a = np.int64(np.floor((points[count, 0] - origin[0]) * inv_cell))
-            b = np.int64(np.floor((points[count, 1] - origin[1]) * inv_cell))
-            c = np.int64(np.floor((points[count, 2] - origin[2]) * inv_cell))
-            if 0 <= a < nx and 0 <= b < ny and 0 <= c < nz and counts[a, b, c] < most:
+            x = (np.float32(j) + half - lens[2]) * inv_x
+            cell = flat_cell(turn, shift, x, y, d, counts.shape)
+            if cell >= 0 and flat[cell] < most:
+                for c in range(3):
+                    ray = rotation[c, 0] * x + rotation[c, 1] * y + rotation[c, 2]
+                    points[count, c] = ray * d + centre[c]
                 count += 1
     return count
 
@@ -87,34 +93,43 @@ def points_in(points, origin, inv_cell, marks, chosen):
 
 
 @njit(parallel=True, cache=True)
-def projective_sdf(points, depths, rotations, centres, lenses, near, truncation, sdf):
+def projective_sdf(points, depths, rotations, centres, lenses, fars, near, truncation, sdf):
     """Mean over frames of depth reading minus depth of the point, clipped to the truncation; NaN where none counts.
 
     A frame counts where the point is in its image, has a reading, and lies less than `truncation` behind it
     (Curless and Levoy 1996). Near views weigh more, by 1 / z^2: their pixels are smaller. The farther behind its
     reading, the less a frame weighs: on the far side of a thin sheet the views of that side decide.
+    fars (F,) float32: the deepest reading of each frame, m. The nearer consecutive points, the fewer frames are asked.
     """
     height, width = depths.shape[1], depths.shape[2]
-    for n in prange(points.shape[0]):
-        total, weight = 0.0, 0.0
-        for f in range(depths.shape[0]):
-            dx, dy, dz = points[n, 0] - centres[f, 0], points[n, 1] - centres[f, 1], points[n, 2] - centres[f, 2]
-            z = rotations[f, 0, 2] * dx + rotations[f, 1, 2] * dy + rotations[f, 2, 2] * dz
-            if z < near:
+    for c in prange((points.shape[0] + CHUNK - 1) // CHUNK):
+        first, last = c * CHUNK, min((c + 1) * CHUNK, points.shape[0])
+        sphere = np.empty(4, np.float32)
+        bounding_sphere(points[first:last], sphere)
+        sphere[3] *= SLACK
+        totals, weights = np.zeros(last - first), np.zeros(last - first)
+        for f in range(depths.shape[0]):  # points within: they read neighbouring pixels
+            if not meets_frustum(sphere, rotations[f], centres[f], lenses[f], width, height, fars[f] + truncation):
                 continue
-            x = rotations[f, 0, 0] * dx + rotations[f, 1, 0] * dy + rotations[f, 2, 0] * dz
-            y = rotations[f, 0, 1] * dx + rotations[f, 1, 1] * dy + rotations[f, 2, 1] * dz
-            j = np.int64(np.floor(lenses[f, 0] * x / z + lenses[f, 2]))
-            i = np.int64(np.floor(lenses[f, 1] * y / z + lenses[f, 3]))
-            if i < 0 or j < 0 or i >= height or j >= width:
-                continue
-            d = depths[f, i, j]
-            ahead = d - z
-            if not d > 0.0 or ahead <= -truncation:
-                continue
-            w = 1.0 / (z * z)
-            if ahead < 0.0:
-                w *= (1.0 + ahead / truncation) ** 2
-            total += w * min(ahead, truncation)
-            weight += w
-        sdf[n] = total / weight if weight > 0.0 else np.nan
+            for n in range(first, last):
+                dx, dy, dz = points[n, 0] - centres[f, 0], points[n, 1] - centres[f, 1], points[n, 2] - centres[f, 2]
+                z = rotations[f, 0, 2] * dx + rotations[f, 1, 2] * dy + rotations[f, 2, 2] * dz
+                if z < near:
+                    continue
+                x = rotations[f, 0, 0] * dx + rotations[f, 1, 0] * dy + rotations[f, 2, 0] * dz
+                y = rotations[f, 0, 1] * dx + rotations[f, 1, 1] * dy + rotations[f, 2, 1] * dz
+                j = np.int64(np.floor(lenses[f, 0] * x / z + lenses[f, 2]))
+                i = np.int64(np.floor(lenses[f, 1] * y / z + lenses[f, 3]))
+                if i < 0 or j < 0 or i >= height or j >= width:
+                    continue
+                d = depths[f, i, j]
+                ahead = d - z
+                if not d > 0.0 or ahead <= -truncation:
+                    continue
+                w = 1.0 / (z * z)
+                if ahead < 0.0:
+                    w *= (1.0 + ahead / truncation) ** 2
+                totals[n - first] += w * min(ahead, truncation)
+                weights[n - first] += w
+        for n in range(first, last):
+            sdf[n] = totals[n - first] / weights[n - first] if weights[n - first] > 0.0 else np.nan

@@ -8,6 +8,8 @@ uint8 on cells of 1 / inv_size m from `low` (3,) up: OPEN, or EXPLAINED (the low
 import numpy as np
 from numba import njit, prange
 
+from active3d_pipe.export.kernels_views import flat_cell, to_cells
+
 OPEN, EXPLAINED = np.uint8(0), np.uint8(1)
 _DONE = np.uint8(3)  # explained, and so are the cells around it
 EVEN = np.float32(0.25)  # how much the slope of a plane may seem to change from one pixel to the next
@@ -40,32 +42,44 @@ def mark_faces(vertices, faces, low, inv_size, marks):
         marks[i, j, k] = _DONE
 
 
-@njit(inline="always")
-def _cell(rotation, centre, intrinsics, row, column, d, low, inv_size, marks):
-    """Flat cell of the reading of one pixel; -1 outside the grid."""
-    nx, ny, nz = marks.shape
-    x = (column + np.float32(0.5) - intrinsics[2]) / intrinsics[0] * d
-    y = (row + np.float32(0.5) - intrinsics[3]) / intrinsics[1] * d
-    i = int(np.floor((rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * d + centre[0] - low[0]) * inv_size))
-    j = int(np.floor((rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * d + centre[1] - low[1]) * inv_size))
-    k = int(np.floor((rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * d + centre[2] - low[2]) * inv_size))
-    if i < 0 or j < 0 or k < 0 or i >= nx or j >= ny or k >= nz:
-        return -1
-    return (i * ny + j) * nz + k
-
-
-@njit(parallel=True, fastmath=True, cache=True)
+@njit(nogil=True, fastmath=True, cache=True)
 def reading_cells(rotation, centre, intrinsics, depth, near, low, inv_size, marks, cells):
     """cells (H, W) int64: flat cell of every reading that lies in a cell that is not EXPLAINED; -1 elsewhere."""
-    flat = marks.reshape(-1)
-    for row in prange(depth.shape[0]):
+    turn, shift = to_cells(rotation, centre, low, inv_size)
+    flat, half = marks.reshape(-1), np.float32(0.5)
+    inv_x, inv_y = np.float32(1) / intrinsics[0], np.float32(1) / intrinsics[1]
+    for row in range(depth.shape[0]):
+        y = (np.float32(row) + half - intrinsics[3]) * inv_y
         for column in range(depth.shape[1]):
             d, cell = depth[row, column], np.int64(-1)
             if d > near:
-                cell = _cell(rotation, centre, intrinsics, row, column, d, low, inv_size, marks)
+                x = (np.float32(column) + half - intrinsics[2]) * inv_x
+                cell = flat_cell(turn, shift, x, y, d, marks.shape)
                 if cell >= 0 and flat[cell] & 1:
                     cell = -1
             cells[row, column] = cell
+
+
+@njit(nogil=True, fastmath=True, cache=True)
+def open_pixels(rotation, centre, intrinsics, depth, stride, near, low, inv_size, marks, cells, pixels):
+    """Of every `stride`-th pixel those whose reading lies in a cell that is not EXPLAINED; returns how many.
+
+    cells (N,) int64 gets their flat cells, pixels (N,) int32 their place in depth (H, W), row by row.
+    """
+    turn, shift = to_cells(rotation, centre, low, inv_size)
+    flat, half, count = marks.reshape(-1), np.float32(0.5), 0
+    inv_x, inv_y = np.float32(1) / intrinsics[0], np.float32(1) / intrinsics[1]
+    for row in range(0, depth.shape[0], stride):
+        y = (np.float32(row) + half - intrinsics[3]) * inv_y
+        for column in range(0, depth.shape[1], stride):
+            d = depth[row, column]
+            if d > near:
+                x = (np.float32(column) + half - intrinsics[2]) * inv_x
+                cell = flat_cell(turn, shift, x, y, d, marks.shape)
+                if cell >= 0 and not flat[cell] & 1:
+                    cells[count], pixels[count] = cell, row * depth.shape[1] + column
+                    count += 1
+    return count
 
 
 @njit(parallel=True, fastmath=True, cache=True)
@@ -121,7 +135,7 @@ def _one_plane(depth, i, j, down, across, step, longest):
     return False
 
 
-@njit(cache=True)
+@njit(nogil=True, cache=True)
 def sheet_faces(cells, own, depth, step, longest, numbers, faces):
     """Faces over a frame's pixels, and their number; `numbers` (H, W) int32 gets the vertex of a pixel, or -1.
 

@@ -2,7 +2,8 @@
 """What logged frames say of a surface: which cells hold readings, which faces were seen, what colour vertices have.
 
 Faces and vertices come in spatial order, so they are handled in chunks with a bounding sphere: a frame looks only at
-the chunks that its frustum meets. Every chunk is written by one task only, frames come one after another.
+the chunks that its frustum meets. Where frames only set marks they may come at the same time; colours are summed chunk
+by chunk in the order of the frames.
 `rotation` (3, 3) is camera -> world, `centre` (3,) m, `intrinsics` (fx, fy, cx, cy); all float32.
 """
 
@@ -46,25 +47,31 @@ def sum_normals(vertices, faces, sums):
                 sums[faces[f, m], d] += normal[d]
 
 
+@njit(cache=True)
+def bounding_sphere(points, sphere):
+    """sphere (4,) float32: centre of the bounding box and radius of points (N, 3) float32, N > 0."""
+    radius = np.float32(0)
+    for d in range(3):
+        low, high = points[0, d], points[0, d]
+        for k in range(points.shape[0]):
+            low, high = min(low, points[k, d]), max(high, points[k, d])
+        sphere[d] = np.float32(0.5) * (low + high)
+    for k in range(points.shape[0]):
+        x, y, z = points[k, 0] - sphere[0], points[k, 1] - sphere[1], points[k, 2] - sphere[2]
+        radius = max(radius, x * x + y * y + z * z)
+    sphere[3] = np.sqrt(radius)
+
+
 @njit(parallel=True, cache=True)
 def bounding_spheres(points, spheres):
     """spheres (C, 4) float32: centre of the bounding box and radius of each chunk of points (N, 3) float32."""
     for c in prange(spheres.shape[0]):
-        first, last = c * CHUNK, min((c + 1) * CHUNK, points.shape[0])
-        radius = np.float32(0)
-        for d in range(3):
-            low, high = points[first, d], points[first, d]
-            for k in range(first, last):
-                low, high = min(low, points[k, d]), max(high, points[k, d])
-            spheres[c, d] = np.float32(0.5) * (low + high)
-        for k in range(first, last):
-            x, y, z = points[k, 0] - spheres[c, 0], points[k, 1] - spheres[c, 1], points[k, 2] - spheres[c, 2]
-            radius = max(radius, x * x + y * y + z * z)
-        spheres[c, 3] = np.sqrt(radius)
+        bounding_sphere(points[c * CHUNK : (c + 1) * CHUNK], spheres[c])
 
 
 @njit(cache=True)
-def _meets_frustum(sphere, rotation, centre, intrinsics, width, height, far):
+def meets_frustum(sphere, rotation, centre, intrinsics, width, height, far):
+    """Whether a sphere (x, y, z, radius) reaches into what a frame sees up to `far` m."""
     dx, dy, dz = sphere[0] - centre[0], sphere[1] - centre[1], sphere[2] - centre[2]
     x = rotation[0, 0] * dx + rotation[1, 0] * dy + rotation[2, 0] * dz
     y = rotation[0, 1] * dx + rotation[1, 1] * dy + rotation[2, 1] * dz
@@ -81,20 +88,25 @@ def _meets_frustum(sphere, rotation, centre, intrinsics, width, height, far):
     )
 
 
-@njit(parallel=True, fastmath=True, cache=True)
-def mark_seen(spheres, centroids, normals, rotation, centre, intrinsics, depth, near, far, tolerance, cosine, seen):
+@njit(nogil=True, fastmath=True, cache=True)
+def mark_seen(
+    spheres, centroids, normals, rotation, centre, intrinsics, depth, near, far, tolerance, cosine, done, seen
+):
     """Set seen[k] for the faces that the frame sees; `view_fusion.cull_unseen` explains what that means.
 
-    centroids, normals (F, 3) float32 world; depth (H, W) float32 m; seen (F,) bool; far: the deepest reading, m.
+    centroids, normals (F, 3) float32 world; depth (H, W) float32 m; seen (F,) bool; far: the deepest reading, m;
+    done (C,) bool: chunks whose faces have all been seen. Frames may come at the same time: nothing is taken back.
     """
     height, width = depth.shape
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
-    for c in prange(spheres.shape[0]):
-        if not _meets_frustum(spheres[c], rotation, centre, intrinsics, width, height, far + tolerance):
+    for c in range(spheres.shape[0]):
+        if done[c] or not meets_frustum(spheres[c], rotation, centre, intrinsics, width, height, far + tolerance):
             continue
+        missing = False
         for k in range(c * CHUNK, min((c + 1) * CHUNK, centroids.shape[0])):
             if seen[k]:
                 continue
+            missing = True
             dx, dy, dz = centroids[k, 0] - centre[0], centroids[k, 1] - centre[1], centroids[k, 2] - centre[2]
             z = rotation[0, 2] * dx + rotation[1, 2] * dy + rotation[2, 2] * dz
             if z <= near:
@@ -109,6 +121,8 @@ def mark_seen(spheres, centroids, normals, rotation, centre, intrinsics, depth, 
             towards = -(normals[k, 0] * dx + normals[k, 1] * dy + normals[k, 2] * dz)
             if towards >= cosine * np.sqrt(dx * dx + dy * dy + dz * dz):
                 seen[k] = True
+        if not missing:
+            done[c] = True
 
 
 @njit(cache=True)
@@ -137,43 +151,65 @@ def widen(marks, reach, out):
                         out[a, b, c] |= marks[a, other, c]
 
 
-@njit(parallel=True, fastmath=True, cache=True)
+@njit(inline="always")
+def to_cells(rotation, centre, low, inv_size):
+    """Rotation and centre such that a camera point maps to cells, instead of metres, from the grid's corner."""
+    turn, shift = np.empty((3, 3), np.float32), np.empty(3, np.float32)
+    for m in range(3):
+        shift[m] = (centre[m] - low[m]) * inv_size
+        for n in range(3):
+            turn[m, n] = rotation[m, n] * inv_size
+    return turn, shift
+
+
+@njit(inline="always")
+def flat_cell(turn, shift, x, y, d, shape):
+    """Flat cell of the reading d on the ray (x, y, 1); -1 outside the grid."""
+    a = (turn[0, 0] * x + turn[0, 1] * y + turn[0, 2]) * d + shift[0]
+    b = (turn[1, 0] * x + turn[1, 1] * y + turn[1, 2]) * d + shift[1]
+    c = (turn[2, 0] * x + turn[2, 1] * y + turn[2, 2]) * d + shift[2]
+    if a < 0 or b < 0 or c < 0 or a >= shape[0] or b >= shape[1] or c >= shape[2]:
+        return np.int64(-1)
+    return (np.int64(a) * shape[1] + np.int64(b)) * shape[2] + np.int64(c)
+
+
+@njit(nogil=True, fastmath=True, cache=True)
 def mark_readings(rotation, centre, intrinsics, depth, stride, join, low, inv_size, marks):
     """Mark the cells of `marks` (X, Y, Z) bool, lowest corner `low` (3,), that a depth reading lies in.
 
     Of `depth` (H, W) every `stride`-th pixel is read. Between neighbours whose depths differ by less than `join` of
-    their mean the line is marked too, so that a surface seen at a grazing angle leaves no gaps. Tasks may mark the
-    same cell.
+    their mean the line is marked too, so that a surface seen at a grazing angle leaves no gaps. Frames may come at
+    the same time.
     """
     height, width = depth.shape
-    for row in prange((height + stride - 1) // stride):
-        i = row * stride
+    turn, shift = to_cells(rotation, centre, low, inv_size)
+    flat, half = marks.reshape(-1), np.float32(0.5)
+    inv_x, inv_y = np.float32(1) / intrinsics[0], np.float32(1) / intrinsics[1]
+    for i in range(0, height, stride):
         for j in range(0, width, stride):
             d = depth[i, j]
             if d <= 0:
                 continue
-            x = (j + np.float32(0.5) - intrinsics[2]) / intrinsics[0] * d
-            y = (i + np.float32(0.5) - intrinsics[3]) / intrinsics[1] * d
+            x = (np.float32(j) + half - intrinsics[2]) * inv_x * d
+            y = (np.float32(i) + half - intrinsics[3]) * inv_y * d
+            cell = flat_cell(turn, shift, x / d, y / d, d, marks.shape)
+            if cell >= 0:
+                flat[cell] = True
             for side in range(2):
                 i2, j2 = i + stride * side, j + stride * (1 - side)
-                pieces, x2, y2, d2 = 1, x, y, d
-                if i2 < height and j2 < width and abs(depth[i2, j2] - d) < join * d and depth[i2, j2] > 0:
-                    d2 = depth[i2, j2]
-                    x2 = (j2 + np.float32(0.5) - intrinsics[2]) / intrinsics[0] * d2
-                    y2 = (i2 + np.float32(0.5) - intrinsics[3]) / intrinsics[1] * d2
-                    gap = np.sqrt((x2 - x) ** 2 + (y2 - y) ** 2 + (d2 - d) ** 2)
-                    pieces = min(1 + int(gap * inv_size), SPLIT_MAX)
-                for p in range(pieces):
-                    s = np.float32(p) / pieces
-                    px, py, pz = x + s * (x2 - x), y + s * (y2 - y), d + s * (d2 - d)
-                    a = int(np.floor((rotation[0, 0] * px + rotation[0, 1] * py + rotation[0, 2] * pz + centre[0]
-                                      - low[0]) * inv_size))
-                    b = int(np.floor((rotation[1, 0] * px + rotation[1, 1] * py + rotation[1, 2] * pz + centre[1]
-                                      - low[1]) * inv_size))
-                    c = int(np.floor((rotation[2, 0] * px + rotation[2, 1] * py + rotation[2, 2] * pz + centre[2]
-                                      - low[2]) * inv_size))
-                    if 0 <= a < marks.shape[0] and 0 <= b < marks.shape[1] and 0 <= c < marks.shape[2]:
-                        marks[a, b, c] = True
+                if i2 >= height or j2 >= width or abs(depth[i2, j2] - d) >= join * d or depth[i2, j2] <= 0:
+                    continue
+                d2 = depth[i2, j2]
+                x2 = (np.float32(j2) + half - intrinsics[2]) * inv_x * d2
+                y2 = (np.float32(i2) + half - intrinsics[3]) * inv_y * d2
+                gap = np.sqrt((x2 - x) ** 2 + (y2 - y) ** 2 + (d2 - d) ** 2)
+                pieces = min(1 + int(gap * inv_size), SPLIT_MAX)
+                for p in range(1, pieces):
+                    s = np.float32(p) / np.float32(pieces)
+                    z = d + s * (d2 - d)
+                    cell = flat_cell(turn, shift, (x + s * (x2 - x)) / z, (y + s * (y2 - y)) / z, z, marks.shape)
+                    if cell >= 0:
+                        flat[cell] = True
 
 
 @njit(parallel=True, fastmath=True, cache=True)
@@ -192,7 +228,7 @@ def add_colours(
     height, width = depth.shape
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     for c in prange(spheres.shape[0]):
-        if not _meets_frustum(spheres[c], rotation, centre, intrinsics, width, height, far + tolerance):
+        if not meets_frustum(spheres[c], rotation, centre, intrinsics, width, height, far + tolerance):
             continue
         for k in range(c * CHUNK, min((c + 1) * CHUNK, vertices.shape[0])):
             dx, dy, dz = vertices[k, 0] - centre[0], vertices[k, 1] - centre[1], vertices[k, 2] - centre[2]

@@ -12,6 +12,7 @@ import numpy as np
 from active3d_pipe.export import kernels_sheets as kernels
 from active3d_pipe.export.config import MeshSettings
 from active3d_pipe.export.view_fusion import frame_arrays
+from active3d_pipe.geometry.threads import on_threads
 from active3d_pipe.structures import Frame, TriangleMesh, VoxelGrid
 
 CELL = 1.25  # edge of a cell, in marching-cubes cells: a reading is explained within one to two of them from a face
@@ -35,16 +36,16 @@ def with_sheets(
     grid = VoxelGrid.from_bounds(low, high, CELL * settings.voxel_size_m)
     marks = np.zeros(grid.shape, np.uint8)
     kernels.mark_faces(
-        np.ascontiguousarray(mesh.vertices), mesh.faces, grid.origin.astype(np.float32),
-        np.float32(1 / grid.voxel_size), marks,
+        np.ascontiguousarray(mesh.vertices), mesh.faces, *_lattice(grid), marks,
     )
     cells, owners = _wanted(frames, grid, marks, settings)
     if not len(cells):
         return mesh
     vertices, faces = [mesh.vertices], [mesh.faces]
     count = len(mesh.vertices)
-    for index in np.unique(owners):
-        new_vertices, new_faces = _lay(frames[index], grid, marks, cells[owners == index])
+    for new_vertices, new_faces in on_threads(
+        lambda index: _lay(frames[index], grid, marks, cells[owners == index]), np.unique(owners)
+    ):
         vertices.append(new_vertices)
         faces.append(new_faces + np.int32(count))
         count += len(new_vertices)
@@ -55,17 +56,19 @@ def _wanted(
     frames: Sequence[Frame], grid: VoxelGrid, marks: np.ndarray, settings: MeshSettings
 ) -> tuple[np.ndarray, np.ndarray]:
     """Flat cells to be covered, ascending, and for each the index of the frame that covers it."""
-    found = []
-    for index, frame in enumerate(frames):
+    def nearest(index: int) -> tuple[np.ndarray, ...]:
+        """Of one frame the nearest reading of every cell that has some: flat cells, the frame, depths and points."""
+        frame = frames[index]
         stride = min(max(int(grid.voxel_size * frame.camera.fx / FAR_M), 1), 2)
-        all_cells, depth = _reading_cells(frame, grid, marks, stride)
-        rows, columns = np.nonzero(all_cells >= 0)
-        inside, d = all_cells[rows, columns], depth[rows, columns]
-        order = np.lexsort((d, inside))  # the nearest reading of every cell
-        inside, first = np.unique(inside[order], return_index=True)
-        nearest = order[first]
-        points = _points(frame, rows[nearest] * stride, columns[nearest] * stride)
-        found.append((inside, np.full(len(inside), index), d[nearest], points))
+        cells, pixels = _open_pixels(frame, grid, marks, stride)
+        d = frame.depth.reshape(-1)[pixels]
+        order = np.lexsort((d, cells))
+        cells, first = np.unique(cells[order], return_index=True)
+        chosen = order[first]
+        rows, columns = np.divmod(pixels[chosen], frame.depth.shape[1])
+        return cells, np.full(len(cells), index), d[chosen], _points(frame, rows, columns)
+
+    found = on_threads(nearest, range(len(frames)))
     cells, owners, depths, points = (np.concatenate(part) for part in zip(*found, strict=True))
     order = np.lexsort((owners, depths, cells))
     cells, first, counts = np.unique(cells[order], return_index=True, return_counts=True)
@@ -83,25 +86,25 @@ def _wanted(
     return cells[keep], owners[keep]
 
 
-def _reading_cells(
-    frame: Frame, grid: VoxelGrid, marks: np.ndarray, stride: int = 1
-) -> tuple[np.ndarray, np.ndarray]:
-    """Flat cells (h, w) of the unexplained among every `stride`-th reading, -1 elsewhere, and those readings."""
-    rotation, centre, intrinsics = frame_arrays(frame)
-    depth = np.ascontiguousarray(frame.depth[::stride, ::stride])
-    thin = intrinsics / np.float32(stride)
-    thin[2:] += np.float32(0.5 - 0.5 / stride)  # centres of the pixels taken
-    cells = np.empty(depth.shape, np.int64)
-    kernels.reading_cells(
-        rotation, centre, thin, depth, np.float32(frame.camera.near), grid.origin.astype(np.float32),
-        np.float32(1 / grid.voxel_size), marks, cells,
+def _open_pixels(frame: Frame, grid: VoxelGrid, marks: np.ndarray, stride: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of every `stride`-th pixel those with an unexplained reading: flat cells and flat pixels."""
+    most = -(-frame.depth.shape[0] // stride) * -(-frame.depth.shape[1] // stride)
+    cells, pixels = np.empty(most, np.int64), np.empty(most, np.int32)
+    count = kernels.open_pixels(
+        *frame_arrays(frame), frame.depth, stride, np.float32(frame.camera.near), *_lattice(grid), marks, cells, pixels
     )
-    return cells, depth
+    return cells[:count], pixels[:count]
+
+
+def _lattice(grid: VoxelGrid) -> tuple[np.ndarray, np.floating]:
+    """Lowest corner and inverse cell size of a grid: float32, for the kernels."""
+    return grid.origin.astype(np.float32), np.float32(1 / grid.voxel_size)
 
 
 def _lay(frame: Frame, grid: VoxelGrid, marks: np.ndarray, owned: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Faces over the pixels of one frame whose readings lie in the cells `owned`: vertices (world, m) and faces."""
-    cells, depth = _reading_cells(frame, grid, marks)
+    cells, depth = np.empty(frame.depth.shape, np.int64), frame.depth
+    kernels.reading_cells(*frame_arrays(frame), depth, np.float32(frame.camera.near), *_lattice(grid), marks, cells)
     own = np.zeros(cells.shape, bool)
     at = cells >= 0
     own[at] = np.isin(cells[at], owned)

@@ -8,6 +8,7 @@ from active3d_pipe.export import kernels_views as kernels
 from active3d_pipe.export.config import MeshSettings
 from active3d_pipe.export.isosurface import QuerySdf, keep_faces
 from active3d_pipe.geometry.sampling import spread
+from active3d_pipe.geometry.threads import on_threads
 from active3d_pipe.structures import Frame, TriangleMesh, VoxelGrid
 
 QueryColor = QuerySdf
@@ -30,10 +31,13 @@ def near_readings(
     grid = VoxelGrid.from_bounds(low, high, cell_m)
     marks = np.zeros(grid.shape, bool)
     origin = grid.origin.astype(np.float32)
-    for frame in frames:
+
+    def mark(frame: Frame) -> None:
         kernels.mark_readings(
             *frame_arrays(frame), frame.depth, READING_STRIDE, np.float32(JOIN), origin, np.float32(1 / cell_m), marks
         )
+
+    on_threads(mark, frames)
     return grid, dilated(marks, dilate)
 
 
@@ -63,12 +67,16 @@ def cull_unseen(mesh: TriangleMesh, frames: Sequence[Frame], settings: MeshSetti
     kernels.face_centres(mesh.vertices, mesh.faces, centroids, normals)
     seen = np.zeros(len(mesh.faces), bool)
     spheres = _spheres(centroids)
-    for frame in frames:
+    done = np.zeros(len(spheres), bool)
+
+    def mark(frame: Frame) -> None:
         kernels.mark_seen(
             spheres, centroids, normals, *frame_arrays(frame), frame.depth, np.float32(frame.camera.near),
             np.float32(frame.depth.max()), np.float32(settings.cull_tolerance_m),
-            np.float32(settings.cull_facing_cosine), seen,
+            np.float32(settings.cull_facing_cosine), done, seen,
         )
+
+    on_threads(mark, frames)
     kernels.grow_faces(mesh.faces, round(settings.cull_margin_m / settings.voxel_size_m), len(mesh.vertices), seen)
     return keep_faces(mesh, seen)
 

@@ -114,7 +114,8 @@ def test_projective_sdf_against_a_slow_reference():
     got = np.empty(len(points), np.float32)
     kernels.projective_sdf(
         points, np.stack([f.depth for f in frames]), np.ascontiguousarray(poses[:, :3, :3]),
-        np.ascontiguousarray(poses[:, :3, 3]), lenses, np.float32(0.05), np.float32(0.06), got,
+        np.ascontiguousarray(poses[:, :3, 3]), lenses, np.array([f.depth.max() for f in frames], np.float32),
+        np.float32(0.05), np.float32(0.06), got,
     )
     total, weight = np.zeros(len(points)), np.zeros(len(points))
     for frame in frames:

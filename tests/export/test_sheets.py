@@ -137,3 +137,33 @@ def test_votes_match_a_plain_loop() -> None:
         gap = frame.depth[row, column] - z[n]
         if min(abs(abs(gap) - 0.05), abs(gap + 0.2)) > 1e-4:
             assert agree[n] == (abs(gap) <= 0.05) and other[n] == (abs(gap) > 0.05 and gap > -0.2)
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_open_pixels_against_a_slow_reference(stride: int) -> None:
+    frame, size = frames()[2], 0.107
+    frame.depth[:20] = 0
+    low = BOX[0].astype(np.float32)
+    marks = np.random.default_rng(3).integers(0, 4, (60, 30, 40)).astype(np.uint8)
+    c, T = frame.camera, frame.T_world_camera.astype(np.float32)
+    pose = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
+    lens = np.array([c.fx, c.fy, c.cx, c.cy], np.float32)
+    lattice = np.float32(c.near), low, np.float32(1 / size), marks
+    cells, pixels = np.empty(frame.depth.size, np.int64), np.empty(frame.depth.size, np.int32)
+    count = kernels.open_pixels(*pose, lens, frame.depth, stride, *lattice, cells, pixels)
+    at = (projection.unproject(frame.depth, frame.T_world_camera, c) - low) / size
+    doubtful = (np.abs(at - np.rint(at)) < 1e-4).any(axis=-1)  # rounding may put them on either side
+    index = np.floor(at).astype(int)
+    inside = ((index >= 0) & (index < marks.shape)).all(axis=-1) & (frame.depth > 0)
+    flat = np.ravel_multi_index(tuple(np.where(inside[..., None], index, 0).T), marks.shape).T
+    want = np.where(inside & (marks.reshape(-1)[flat] & 1 == 0), flat, -1)
+    taken = np.zeros(frame.depth.shape, bool)
+    taken[::stride, ::stride] = True
+    got = np.full(frame.depth.size, -1)
+    got[pixels[:count]] = cells[:count]
+    sure = ~doubtful & taken
+    assert (got.reshape(want.shape)[sure] == want[sure]).all() and (got.reshape(want.shape)[~taken] == -1).all()
+    assert (want[sure] >= 0).sum() > 200 and (np.diff(pixels[:count]) > 0).all()
+    whole = np.empty(frame.depth.shape, np.int64)
+    kernels.reading_cells(*pose, lens, frame.depth, *lattice, whole)
+    assert (whole[~doubtful] == want[~doubtful]).all()
