@@ -135,8 +135,7 @@ def score(  # noqa: PLR0913  (what a decision knows, by name)
         final = utility_rate(np.array([t.reward for t in terms]), steps, settings)
         return np.where(committed, final * settings.commitment, final)
 
-    glance = GLANCE * fan_stride(camera, space.grid.voxel_size, field.max_range_m)
-    terms = exact_terms(field, poses, camera, glance)
+    terms = glance(field, poses, camera)
     by_reward = np.array([t.reward for t in terms])
     # Those that lead by reward say whether anything is left to see: far from that, a glance at them is enough.
     plenty = by_reward.max(initial=0) > PLENTY * max(settings.hidden_reward, settings.stop_reward)
@@ -151,6 +150,11 @@ def score(  # noqa: PLR0913  (what a decision knows, by name)
         poses[order], goal_voxels[order], [terms[i] for i in order], travel[order], final[order], committed[order],
         found.num_candidates, found.voxels, found.rewards.max(axis=1),
     )
+
+
+def glance(field: RewardField, poses: np.ndarray, camera: Camera) -> list[GainTerms]:
+    """`exact_terms` by a coarser fan of rays: in a quarter of the time, which of the poses (C, 4, 4) may lead."""
+    return exact_terms(field, poses, camera, GLANCE * fan_stride(camera, field.grid.voxel_size, field.max_range_m))
 
 
 class _Estimates(NamedTuple):

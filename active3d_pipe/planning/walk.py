@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 
 from active3d_pipe.planning.candidates import Directions
-from active3d_pipe.planning.choice import Pool, reward_density, utility_rate, view_cost_steps
+from active3d_pipe.planning.choice import Pool, glance, reward_density, utility_rate, view_cost_steps
 from active3d_pipe.planning.config import PlanningSettings
 from active3d_pipe.planning.free_space import FreeSpace
 from active3d_pipe.planning.looks import looks_along
 from active3d_pipe.planning.path import step_path
-from active3d_pipe.planning.reward import RewardField, exact_terms
+from active3d_pipe.planning.reward import RewardField
 from active3d_pipe.planning.rrt_star import PlannedPath, plan_path
 from active3d_pipe.structures.camera import Camera
 from active3d_pipe.structures.decision import Decision, Reason
@@ -125,7 +125,7 @@ def _chain(
         near = [i for i, c in zip(open_views, travel, strict=True) if c < task.round_length_m]
         if not near:
             break
-        terms = exact_terms(field, pool.poses[near], task.camera)
+        terms = glance(field, pool.poses[near], task.camera)
         rotations = pool.poses[near][:, :3, :3]
         cost = view_cost_steps(here.cost[tuple(pool.voxels[near].T)], T[:3, :3], rotations, task.motion)
         best = int(utility_rate(np.array([t.reward for t in terms]), cost, settings).argmax())
