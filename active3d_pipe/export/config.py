@@ -37,6 +37,10 @@ class MeshSettings(Settings):
         0.004, ge=0,
         description="mean SDF at depth readings from which fused readings replace the field there, m; 0: never",
     )
+    fuse_noise_m: float = Field(
+        0.004, ge=0, description="standard deviation of the depth noise, found in the readings, from which TSDF fusion "
+        "of all of them replaces the field wherever there are many, m; 0: never"
+    )
     fusion_truncation_cells: float = Field(
         2.0, gt=0, description="truncation of that fusion, marching-cubes cells"
     )

@@ -9,6 +9,7 @@ from active3d_pipe.export import kernels_correction as kernels
 from active3d_pipe.export.config import MeshSettings
 from active3d_pipe.export.view_fusion import dilated, frame_arrays
 from active3d_pipe.geometry.sampling import spread
+from active3d_pipe.geometry.sensor_noise import noise_at, sensor_noise
 from active3d_pipe.structures import Frame, VoxelGrid
 
 STRIDE = 4  # of the pixels, every how many are compared with the field
@@ -19,9 +20,6 @@ SURE = 3.0  # standard errors that it must lie off the surface
 SCATTER_M = 0.12  # within which noise shows on both sides of a surface
 BY_NOISE = 5.0  # standard deviations of the sensor's noise up to which it may explain a contradiction
 OTHER_SIDE = 0.2  # share of such a contradiction that may lie on the other side of the surface
-NOISE_FRAMES = 100  # evenly spread, that say what the sensor's noise is
-NOISE_STRIDE = 16  # rows of an image, every how many say what the sensor's noise is
-FROM_MEDIAN = 1 / (0.6745 * 6**0.5)  # standard deviation of a reading by the median of |a - 2 b + c|
 MOST_READINGS = 16  # in a cell, after which further frames are not asked about it
 
 
@@ -84,7 +82,7 @@ def _disputed(
     sums, below, squares, noises = (np.zeros(grid.shape, np.float32) for _ in range(4))
     counts = np.zeros(grid.shape, np.int32)
     compared = spread(frames, MOST_FRAMES)
-    sensor = sensor_noise(spread(compared, NOISE_FRAMES))
+    sensor = sensor_noise(compared)
     against = np.zeros(len(compared), np.int64)
     for index in _scattered(len(compared)):
         frame = compared[index]
@@ -96,7 +94,7 @@ def _disputed(
         if len(points):
             values = query_sdf(points)
             depth = (points - frame.T_world_camera[:3, 3].astype(np.float32)) @ frame.T_world_camera[:3, 2]
-            noise = sensor[np.clip(depth, 0, len(sensor) - 1).astype(np.int64)]
+            noise = noise_at(sensor, depth)
             kernels.add_readings(points, values, noise, origin, inv_cell, sums, below, squares, noises, counts)
             against[index] = (np.abs(values) > settings.dispute_m).sum()
     marks = np.zeros(grid.shape, bool)
@@ -114,28 +112,6 @@ def _disputed(
     marks[tuple(where[off].T)] = True
     order = np.argsort(-against, kind="stable")[:MOST_FUSED]
     return grid, dilated(marks, 1), [compared[int(i)] for i in np.sort(order)]
-
-
-def sensor_noise(frames: Sequence[Frame]) -> np.ndarray:
-    """(D,) float32 standard deviation of the depth noise, m, of readings from 0 to 1 m, from 1 to 2 m, and so on.
-
-    By the second difference of the inverse depth along image rows, which is zero on planes, however they are seen: its
-    median over all readings leaves edges and what is curved out of account.
-    """
-    depths, errors = [], []
-    for frame in frames:
-        d = frame.depth[NOISE_STRIDE // 2 :: NOISE_STRIDE]
-        d = np.where(d > 0, d, np.nan)
-        inverse, middle = 1 / d, d[:, 1:-1]
-        error = np.abs(inverse[:, :-2] - 2 * inverse[:, 1:-1] + inverse[:, 2:]) * middle**2
-        known = np.isfinite(error)
-        depths.append(middle[known].astype(np.int64))
-        errors.append(error[known])
-    near, error = np.concatenate(depths), np.concatenate(errors)
-    out = np.zeros(max(int(near.max(initial=0)), 0) + 1, np.float32)
-    for metre in np.unique(near):
-        out[metre] = np.median(error[near == metre]) * FROM_MEDIAN
-    return out
 
 
 def _scattered(count: int) -> list[int]:

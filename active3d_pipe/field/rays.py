@@ -11,12 +11,15 @@ import numpy as np
 
 from active3d_pipe.errors import InputError
 from active3d_pipe.field.config import FieldSettings
+from active3d_pipe.geometry.sensor_noise import noise_at
 from active3d_pipe.structures import Frame
 
 MIN_SLOPE = 0.1  # rays that graze a surface by less than about 6 degrees are taken at this slope
 REDRAWS = 3
 GROUP = 16  # rays are drawn in groups of one frame: gathering costs by the frame
 SURFACE_GROUP = 64  # likewise readings, of which no neighbours are asked
+TILT = 0.2  # slopes are taken from neighbours so far away that noise tilts them by about this much
+FARTHEST = 16  # px
 SPARE = 2  # pixels drawn for each, so that some may be without a reading
 NEIGHBOURS = ((0, 1), (0, -1), (1, 0), (-1, 0))
 
@@ -47,7 +50,8 @@ class RayBatch:
 
 
 def sample_rays(
-    frames: Sequence[Frame], count: int, rng: np.random.Generator, weights: np.ndarray | None = None
+    frames: Sequence[Frame], count: int, rng: np.random.Generator, weights: np.ndarray | None = None,
+    noise: np.ndarray | None = None,
 ) -> RayBatch:
     """Draw `count` pixels from `frames`.
 
@@ -56,6 +60,8 @@ def sample_rays(
         count: number of rays.
         rng: source of randomness.
         weights: (len(frames),) relative probabilities of the frames; uniform when None.
+        noise: (D,) standard deviation of readings, m, by metre of depth (`geometry.sensor_noise`): the noisier, the
+            farther away are the neighbours that slopes are taken from. None: exact readings.
 
     Pixels without a depth reading are drawn anew up to `REDRAWS` times; what is still without one stays in the
     batch with `valid` False. Frames are drawn for groups of `GROUP` rays; the rays come sorted by frame.
@@ -68,8 +74,8 @@ def sample_rays(
     draws = rng.random((count, 1 + REDRAWS), dtype=np.float32)
     taken, first, per_frame = np.unique(of_ray, return_index=True, return_counts=True)
     # Only the gathering runs frame by frame; the arithmetic is done once for the whole batch.
-    parts = [_gather(frames[k], draws[i : i + n]) for k, i, n in zip(taken, first, per_frame, strict=True)]
-    pixel, z, rgb = (np.concatenate(column) for column in zip(*parts, strict=True))
+    parts = [_gather(frames[k], draws[i : i + n], noise) for k, i, n in zip(taken, first, per_frame, strict=True)]
+    pixel, z, apart, rgb = (np.concatenate(column) for column in zip(*parts, strict=True))
     camera = np.repeat([_intrinsics(frames[k]) for k in taken], per_frame, axis=0).astype(np.float32)
     poses = np.repeat([frames[k].T_world_camera for k in taken], per_frame, axis=0)
     u = (pixel + np.float32(0.5) - camera[:, 2:4]) / camera[:, :2]
@@ -81,7 +87,7 @@ def sample_rays(
         depth=np.where(valid, z[:, 0], 0).astype(np.float32),
         color=rgb.astype(np.float32) / np.float32(255),
         valid=valid,
-        slope=_slope(z, local, camera[:, :2]),
+        slope=_slope(z, local, camera[:, :2] / apart[:, None]),
     )
 
 
@@ -109,11 +115,14 @@ def _intrinsics(frame: Frame) -> tuple[float, float, float, float, float]:
     return c.fx, c.fy, c.cx, c.cy, c.far
 
 
-def _gather(frame: Frame, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _gather(
+    frame: Frame, draws: np.ndarray, noise: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """What the frame shows at random pixels, for n rays with draws (n, D) in 0..1.
 
     Returns pixels (n, 2) float32 (column, row), depths (n, 5) of the pixel and its neighbours right, left,
-    below, above (0 outside the image), and colours (n, 3) uint8. The first of the D pixels with a reading counts.
+    below, above (0 outside the image), how many pixels these are away (n,) float32, and colours (n, 3) uint8. The first
+    of the D pixels with a reading counts.
     """
     height, width = frame.depth.shape
     flat = np.minimum((draws * np.float64(frame.depth.size)).astype(np.int64), frame.depth.size - 1)
@@ -124,15 +133,20 @@ def _gather(frame: Frame, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     i, j = np.divmod(flat, width)
     z = np.zeros((len(flat), 5), np.float32)
     z[:, 0] = d[rows, choice]
+    apart = np.ones(len(flat), np.int64)
+    if noise is not None:
+        pixels = noise_at(noise, z[:, 0]) * frame.camera.fx / np.maximum(z[:, 0], np.float32(1e-3))
+        apart = np.clip(np.ceil(pixels / TILT), 1, FARTHEST).astype(np.int64)
     for k, (di, dj) in enumerate(NEIGHBOURS, start=1):
-        ni, nj = i + di, j + dj
+        ni, nj = i + di * apart, j + dj * apart
         ok = (ni >= 0) & (ni < height) & (nj >= 0) & (nj < width)
         z[ok, k] = frame.depth[ni[ok], nj[ok]]
-    return np.column_stack([j, i]).astype(np.float32), z, frame.rgb.reshape(-1, 3)[flat]
+    return np.column_stack([j, i]).astype(np.float32), z, apart.astype(np.float32), frame.rgb.reshape(-1, 3)[flat]
 
 
 def _slope(z: np.ndarray, local: np.ndarray, focal: np.ndarray) -> np.ndarray:
-    """(R,) |normal . direction| from depths (R, 5), directions in the camera frame (R, 3), focal lengths (R, 2).
+    """(R,) |normal . direction| from depths (R, 5), directions in the camera frame (R, 3), focal lengths (R, 2)
+    in units of the neighbours' distance.
 
     Along each image axis the neighbour nearer in depth is taken, so that an edge does not tilt the normal; 1 where
     an axis has no neighbour with a reading.

@@ -106,6 +106,11 @@ class TsdfField:
         """(N,) float32 SDF in m at world points (N, 3), cut at +-truncation."""
         return self._interpolate(points)[:, 0] * np.float32(self.truncation_m)
 
+    def query_fused(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(sdf, m, and how many readings it is the mean of), both (N,) float32, at world points (N, 3)."""
+        found = self._interpolate(points)
+        return found[:, 0] * np.float32(self.truncation_m), found[:, 1]
+
     def query_geometry(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(sdf, sigma), both (N,) float32 m, at world points (N, 3)."""
         found = self._interpolate(points)

@@ -94,15 +94,15 @@ def train_gaussians(
 
 def train_field(
     hybrid: HybridMap, frames: Sequence[Frame], weights: np.ndarray | None, rng: np.random.Generator, clock: Clock,
-    rate: float = 1.0,
+    rate: float = 1.0, noise: np.ndarray | None = None,
 ) -> dict[str, float]:
-    """One iteration of the implicit branch on rays and readings of `frames`."""
+    """One iteration of the implicit branch on rays and readings of `frames`; `noise` as of `sample_rays`."""
     settings = hybrid.settings.field
     if not isinstance(hybrid.field, SdfField) or hybrid.optimiser is None:
         raise ConfigError("mapping: a TSDF is fused, not trained")
     hybrid.field_changed()
     with clock.of("ray sampling"):
-        batch = sample_rays(frames, settings.rays, rng, weights)
+        batch = sample_rays(frames, settings.rays, rng, weights, noise)
         surface = surface_points(frames, settings.surface_points, rng, weights)
 
     def add(part: str, seconds: float) -> None:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from active3d_pipe.errors import NumericalError
+from active3d_pipe.geometry.sensor_noise import sensor_noise
 from active3d_pipe.mapping import branches
 from active3d_pipe.mapping.frame_order import exposure, visiting_order
 from active3d_pipe.mapping.hybrid_map import HybridMap
@@ -30,9 +31,10 @@ def refine(
     Frames are visited by how much is to be seen of what they show (`frame_order`). Held-out views are never seen here.
     """
     settings, clock = hybrid.settings, branches.Clock()
+    noise = sensor_noise(frames)
     for i in range(settings.refinement_field_iterations if settings.geometry == "neural" else 0):
         rate = annealed(i, settings.refinement_field_iterations)
-        branches.train_field(hybrid, frames, None, rng, clock, rate)
+        branches.train_field(hybrid, frames, None, rng, clock, rate, noise)
         if i % 20 == 0:
             progress(f"refining field {i}/{settings.refinement_field_iterations}")
     total, added, pruned = settings.refinement_iterations if settings.views == "gaussians" else 0, 0, 0

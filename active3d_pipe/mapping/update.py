@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 
 from active3d_pipe.errors import NumericalError
+from active3d_pipe.geometry.sampling import spread
+from active3d_pipe.geometry.sensor_noise import sensor_noise
 from active3d_pipe.mapping import branches
 from active3d_pipe.mapping.config import MappingSettings
 from active3d_pipe.mapping.hybrid_map import HybridMap
@@ -15,6 +17,7 @@ from active3d_pipe.mapping.window import choose_window, draw_keyframe, draw_olde
 from active3d_pipe.structures import Frame, UncertaintyVolume
 
 PRUNE_EVERY = 100  # iterations
+NOISE_FRAMES = 10  # keyframes that say how noisy the sensor is
 OTHERS_LOOKED_AT = 1  # keyframes of the window, beside the new ones, that error-driven adding looks at in a round
 
 
@@ -109,9 +112,11 @@ def _field(hybrid: HybridMap, num_new: int, iterations: int, rng: np.random.Gene
     if 0 < num_new < len(frames):
         weights *= 0.5
         weights[-num_new:] += 0.5 / num_new
+    with clock.of("ray sampling"):
+        noise = sensor_noise(spread(frames, NOISE_FRAMES))
     loss = 0.0
     for _ in range(iterations):
-        loss = branches.train_field(hybrid, frames, weights, rng, clock)["total"]
+        loss = branches.train_field(hybrid, frames, weights, rng, clock, noise=noise)["total"]
     return loss
 
 

@@ -7,6 +7,7 @@ from active3d_pipe.export.config import MeshSettings
 from active3d_pipe.export.correction import corrected_sdf
 from active3d_pipe.export.isosurface import extract_mesh
 from active3d_pipe.geometry import projection, se3
+from active3d_pipe.geometry.sensor_noise import sensor_noise
 from active3d_pipe.structures import Camera, Frame
 
 LOW, HIGH = np.array([-1.0, -1.0, -1.0]), np.array([1.0, 1.0, 1.0])
@@ -80,7 +81,7 @@ def test_what_noise_scatters_about_a_wall_is_no_contradiction(monkeypatch):
         rays = projection.pixel_rays(camera).astype(np.float64) @ T[:3, :3].T
         depth = (-0.5 - T[0, 3]) / rays[..., 0] + rng.normal(0, 0.04, rays.shape[:2])
         frames.append(Frame(0, 0, camera, T, np.zeros((120, 120, 3), np.uint8), depth.astype(np.float32)))
-    noise = correction.sensor_noise(frames)
+    noise = sensor_noise(frames)
     assert noise[1] == pytest.approx(0.04, rel=0.05)
     points = rng.uniform([-0.7, -0.4, -0.4], [-0.2, 0.4, 0.4], (4000, 3)).astype(np.float32)
 
@@ -93,11 +94,11 @@ def test_what_noise_scatters_about_a_wall_is_no_contradiction(monkeypatch):
 
 
 def test_noiseless_depth_has_no_noise():
-    noise = correction.sensor_noise(both_sides())
+    noise = sensor_noise(both_sides())
     assert noise.dtype == np.float32 and noise.max() < 1e-4
     nothing = view((0.9, 0.0, 0.0))
     nothing.depth[:] = 0
-    assert correction.sensor_noise([nothing]).tolist() == [0.0]
+    assert sensor_noise([nothing]).tolist() == [0.0]
 
 
 def test_zero_means_never():

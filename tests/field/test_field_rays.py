@@ -8,6 +8,7 @@ from active3d_pipe.errors import InputError
 from active3d_pipe.field.config import FieldSettings
 from active3d_pipe.field.rays import points_on_rays, sample_depths, sample_rays, surface_points
 from active3d_pipe.geometry import se3
+from active3d_pipe.geometry.sensor_noise import sensor_noise
 from active3d_pipe.structures import Camera, Frame
 
 
@@ -38,6 +39,21 @@ def test_slope_gives_the_distance_to_the_surface(frames):
     error = np.abs(scene_sdf(before) - 0.005 * np.maximum(b.slope, 0.1))
     assert np.quantile(error, 0.9) < 3e-4
     assert b.slope.std() > 0.1
+
+
+def test_slopes_stand_noise_when_it_is_told(frames):
+    rng, sigma = np.random.default_rng(5), 0.01
+    noisy = [dataclasses.replace(f, depth=f.depth + rng.normal(0, sigma, f.depth.shape).astype(np.float32))
+             for f in frames]
+    found = sensor_noise(noisy)
+    assert found[2] == pytest.approx(sigma, rel=0.15)
+    exact = sample_rays(frames, 2000, np.random.default_rng(1)).slope
+    near = sample_rays(noisy, 2000, np.random.default_rng(1)).slope
+    far = sample_rays(noisy, 2000, np.random.default_rng(1), noise=found).slope
+    assert np.abs(far - exact).mean() < 0.6 * np.abs(near - exact).mean()
+    # Told that there is none, the neighbours are the next pixels, to the bit.
+    told = sample_rays(frames, 2000, np.random.default_rng(1), noise=sensor_noise(frames)).slope
+    assert np.array_equal(told, exact)
 
 
 def test_pixels_without_reading_are_avoided_or_marked(frames):
