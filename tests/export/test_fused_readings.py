@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from active3d_pipe.export import fused_readings
 from active3d_pipe.export.config import MeshSettings
 from active3d_pipe.export.fused_readings import fused_if_noisy, typical_noise
 from active3d_pipe.geometry import projection, se3
@@ -49,6 +50,11 @@ def test_exact_or_few_readings_leave_the_field_alone() -> None:
     few = fused_if_noisy(biased, LOW, HIGH, frames(0.02, count=4), SETTINGS)
     points = np.random.default_rng(0).uniform([-0.4, 1.9, -0.4], [0.4, 2.1, 0.4], (100, 3)).astype(np.float32)
     assert np.array_equal(few(points), biased(points))
+
+
+def test_a_scene_too_large_to_fuse_keeps_the_field(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fused_readings, "MOST_MEGABYTES", 0.5)
+    assert fused_if_noisy(biased, LOW, HIGH, frames(0.02), SETTINGS) is biased
 
 
 def test_without_a_reading_there_is_no_noise() -> None:
