@@ -1,7 +1,6 @@
 """The field's SDF, replaced by fused depth readings where these contradict it: thin parts that the field washes out."""
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -10,6 +9,7 @@ from active3d_pipe.export.config import MeshSettings
 from active3d_pipe.export.view_fusion import dilated, frame_arrays
 from active3d_pipe.geometry.sampling import spread
 from active3d_pipe.geometry.sensor_noise import noise_at, sensor_noise
+from active3d_pipe.geometry.threads import on_threads
 from active3d_pipe.structures import Frame, VoxelGrid
 
 STRIDE = 4  # of the pixels, every how many are compared with the field
@@ -48,8 +48,8 @@ def corrected_sdf(
     poses = np.stack([f.T_world_camera for f in fused]).astype(np.float32)
     lenses = np.array([[f.camera.fx, f.camera.fy, f.camera.cx, f.camera.cy] for f in fused], np.float32)
     depths = np.empty((len(fused), *fused[0].depth.shape), np.float32)
-    with ThreadPoolExecutor() as pool:  # a tenth of a gigabyte, whose fresh pages cost more than the copying
-        list(pool.map(np.copyto, depths, [f.depth for f in fused]))
+    # A tenth of a gigabyte, whose fresh pages cost more than the copying.
+    on_threads(lambda pair: np.copyto(*pair), zip(depths, (f.depth for f in fused), strict=True))
     views = (
         depths, np.ascontiguousarray(poses[:, :3, :3]),
         np.ascontiguousarray(poses[:, :3, 3]), lenses, np.array([f.depth.max() for f in fused], np.float32),
