@@ -31,12 +31,13 @@ def refine(
     Frames are visited by how much is to be seen of what they show (`frame_order`). Held-out views are never seen here.
     """
     settings, clock = hybrid.settings, branches.Clock()
-    noise = sensor_noise(frames)
-    for i in range(settings.refinement_field_iterations if settings.geometry == "neural" else 0):
-        rate = annealed(i, settings.refinement_field_iterations)
+    steps = settings.refinement_field_iterations if settings.geometry == "neural" else 0
+    noise = sensor_noise(frames) if steps else None
+    for i in range(steps):
+        rate = annealed(i, steps)
         branches.train_field(hybrid, frames, None, rng, clock, rate, noise)
         if i % 20 == 0:
-            progress(f"refining field {i}/{settings.refinement_field_iterations}")
+            progress(f"refining field {i}/{steps}")
     total, added, pruned = settings.refinement_iterations if settings.views == "gaussians" else 0, 0, 0
     limit = min(settings.gaussians.max_count, int(len(hybrid.gaussians) * (1 + settings.refinement_growth)))
     growth = limit - len(hybrid.gaussians)
