@@ -29,6 +29,10 @@ from active3d_pipe.structures.uncertainty_volume import UncertaintyVolume
 THOROUGH_PAIRS = 20
 # What a view must bring at least that spreads the walk; 1 = what one voxel was short of that was never looked at.
 LEAST_SHORT = 1.0
+# While views are spread, every how many rounds a quick search asks whether something new has come into reach.
+ASK_EVERY = 4
+
+
 def decide(
     volume: UncertaintyVolume,
     T_world_camera: np.ndarray,
@@ -81,13 +85,14 @@ def _choose(
 ) -> Decision:
     """The decision itself, without the account of predicted and realised gain."""
     T, camera, motion, settings = task.T, task.camera, task.motion, task.settings
-    best = 0.0
     before = np.inf if previous is None else previous.terms.get("best_reward", np.inf)
     # While views are spread, what few places see was just sought in vain; it is sought once more before the stop.
     spreading = previous is not None and previous.reason is Reason.SPREAD
     turns = (task.round,) if before < settings.hidden_reward and not spreading else ()
     usual = space
-    for search in _searches(spreading):
+    searches = _searches(spreading, task.round)
+    best = before if searches[0] == "spread" else 0.0
+    for search in searches:
         if search == "spread":
             decision = _spread(task, volume, usual, field, previous, len(walked), best)
             if decision is not None:
@@ -114,13 +119,15 @@ def _choose(
     return _unstick(task, space, walked, previous, terms)
 
 
-def _searches(spreading: bool) -> tuple[str, ...]:
-    """In which order views are sought; the first search that finds one ends it.
+def _searches(spreading: bool, number: int) -> tuple[str, ...]:
+    """In which order views are sought in round `number`; the first search that finds one ends it.
 
     The quick search overlooks what few views can see; only a thorough one may say that nothing new is left. Once it
-    has said so it is put off to the end of the spreading: it takes long.
+    has said so it is put off to the end of the spreading, and the quick one to every few rounds: they take long.
     """
-    return ("quick", "spread", "thorough", "relaxed") if spreading else ("quick", "thorough", "relaxed", "spread")
+    if not spreading:
+        return "quick", "thorough", "relaxed", "spread"
+    return ("quick", "spread", "thorough", "relaxed")[number % ASK_EVERY != 0 :]
 
 
 def _spread(

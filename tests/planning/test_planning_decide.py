@@ -154,6 +154,19 @@ def test_before_it_stops_it_spreads_its_views_for_a_share_of_the_steps(after_fir
     check_motion(world, walked, MOTION)
 
 
+def test_while_views_are_spread_it_asks_every_fourth_round_whether_something_new_is_in_reach(after_first_look):
+    world, walked, first = after_first_look
+    spreading = take(world, walked, settings=PlanningSettings(stop_reward=1e6, spread_share=9.0), previous=first)
+    assert spreading.reason is Reason.SPREAD
+    settings = PlanningSettings(spread_share=9.0)  # to which there is much left to see
+    found = {
+        k: take(world, walked, settings=settings, previous=spreading, volume=world.volume(k)) for k in range(4, 9)
+    }
+    assert [k for k, d in found.items() if d.reason is Reason.BEST_GAIN] == [4, 8]
+    assert all(found[k].reason is Reason.SPREAD for k in (5, 6, 7))
+    assert found[5].terms["best_reward"] == spreading.terms["best_reward"]
+
+
 def test_a_walled_in_agent_looks_around_goes_back_and_stops():
     world = box_world.build((3.0, 2.0, 2.0), [])
     T = se3.pose_from_yaw_pitch(np.array([1.5, 1.0, 1.0]), 0.0, 0.0)
