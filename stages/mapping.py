@@ -69,4 +69,4 @@ def _let_grow(
     return on_grid(volume, grown_grid(volume.grid, box[0], box[1]))
 
 
-STAGE = Stage(name="mapping", version=8, config=("mapping",), inputs=_inputs, run=_run, loop=True)
+STAGE = Stage(name="mapping", version=9, config=("mapping",), inputs=_inputs, run=_run, loop=True)

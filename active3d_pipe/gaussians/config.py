@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from active3d_pipe.structures import Settings
+from active3d_pipe.structures import Camera, Settings
 
 
 class GaussianSettings(Settings):
@@ -13,6 +13,10 @@ class GaussianSettings(Settings):
     max_count: int = Field(default=1_000_000, ge=1, description="most primitives the model may hold")
 
     # Shape
+    max_growth: float = Field(
+        default=1.5, ge=1, description="largest standard deviation, in units of that of the largest seed: one of the "
+        "coarsest octree cell, or of the spacing of pixels at the far range"
+    )
     isotropic: bool = Field(default=False, description="spheres: one scale for the three axes, no rotation")
     isotropy_weight: float = Field(
         default=0.0, ge=0, description="weight of the mean deviation of the scales from their mean, per metre"
@@ -111,3 +115,9 @@ class GaussianSettings(Settings):
     sdf_band_m: float = Field(
         default=0.05, gt=0, description="only means with |SDF| below this are coupled, m"
     )
+
+    def largest_scale_m(self, camera: Camera) -> float:
+        """The standard deviation, m, that no primitive may grow beyond."""
+        spacing = camera.far / camera.fx
+        cell = self.seed_stride * spacing if self.seed_method == "pixels" else max(self.seed_cell_m, spacing)
+        return self.max_growth * self.seed_sigma_factor * cell

@@ -30,6 +30,14 @@ ASTRAY_M, LARGER = F(0.01), F(1.6)
 
 
 @njit(fastmath=True, cache=True)
+def _settle(values, i, places, largest):
+    """Keep the log-scales of primitive i below `largest`, then `_measure` it."""
+    for j in range(3, 6):
+        values[i, j] = min(values[i, j], largest)
+    _measure(values, i, places)
+
+
+@njit(fastmath=True, cache=True)
 def _measure(values, i, places):
     """places[i] = mean and largest standard deviation of primitive i."""
     places[i, 0], places[i, 1], places[i, 2] = values[i, 0], values[i, 1], values[i, 2]
@@ -46,11 +54,11 @@ def measure(values, places):
 
 
 @njit(parallel=True, fastmath=True, cache=True)
-def adam(values, moment1, moment2, steps, places, rows, grad, rates, beta1, beta2):
+def adam(values, moment1, moment2, steps, places, rows, grad, rates, beta1, beta2, largest):
     """One Adam step (Kingma & Ba 2015) on the rows `rows` (M,) of `values` (N, 14) with `grad` (M, 14), in place.
 
     `places` (N, 4) is kept as `measure` makes it. `steps` (N,) int32 counts the updates of each primitive, so that the
-    bias correction fits those that were added later; `rates` (14,) learning rates.
+    bias correction fits those that were added later; `rates` (14,) learning rates, `largest` log-scale allowed.
     """
     n, width = grad.shape
     one_less_1, one_less_2 = ONE - beta1, ONE - beta2
@@ -71,11 +79,11 @@ def adam(values, moment1, moment2, steps, places, rows, grad, rates, beta1, beta
                 moment1[i, j] = m
                 moment2[i, j] = v
                 values[i, j] -= rates[j] * step * m / (math.sqrt(v) * correct2 + EPSILON)
-            _measure(values, i, places)
+            _settle(values, i, places, largest)
 
 
 @njit(fastmath=True, cache=True)
-def _go_on(values, moment1, moment2, steps, places, i, missed, rates, beta1, beta2):
+def _go_on(values, moment1, moment2, steps, places, i, missed, rates, beta1, beta2, largest):
     """Take `missed` steps of zero gradient at once on primitive i.
 
     The denominators of these steps differ by their bias correction only. It is taken along, but for the share that
@@ -108,13 +116,13 @@ def _go_on(values, moment1, moment2, steps, places, i, missed, rates, beta1, bet
         m *= decay1
         moment1[i, j] = m if abs(m) > TINY else ZERO
         moment2[i, j] *= decay2
-    _measure(values, i, places)
+    _settle(values, i, places, largest)
 
 
 @njit(parallel=True, fastmath=True, cache=True)
 def near(
-    values, moment1, moment2, steps, places, done, now, rates, beta1, beta2, R, t, view, dilation, chunks, which,
-    counts,
+    values, moment1, moment2, steps, places, done, now, rates, beta1, beta2, largest, R, t, view, dilation, chunks,
+    which, counts,
 ):
     """Find the primitives that a view may show, and take the steps that these owe.
 
@@ -134,7 +142,7 @@ def near(
             )[0]:
                 continue
             if missed > 0:
-                _go_on(values, moment1, moment2, steps, places, i, missed, rates, beta1, beta2)
+                _go_on(values, moment1, moment2, steps, places, i, missed, rates, beta1, beta2, largest)
                 done[i] = now
             which[k] = i
             k += 1
@@ -142,7 +150,7 @@ def near(
 
 
 @njit(parallel=True, fastmath=True, cache=True)
-def catch_up(values, moment1, moment2, steps, places, done, now, rows, rates, beta1, beta2):
+def catch_up(values, moment1, moment2, steps, places, done, now, rows, rates, beta1, beta2, largest):
     """Take the steps that the primitives `rows` (M,) owe; see `near`."""
     n = len(rows)
     for c in prange(CHUNKS):
@@ -150,5 +158,5 @@ def catch_up(values, moment1, moment2, steps, places, done, now, rows, rates, be
             i = rows[r]
             missed = now - done[i]
             if missed > 0:
-                _go_on(values, moment1, moment2, steps, places, i, missed, rates, beta1, beta2)
+                _go_on(values, moment1, moment2, steps, places, i, missed, rates, beta1, beta2, largest)
                 done[i] = now

@@ -76,6 +76,8 @@ def optimise_step(  # noqa: PLR0913 - the frame's arrays come one by one
         terms["loss"] += energy
     if settings.isotropic:
         tie_scales(gradient.grads)
-    params.step(gradient.grads, settings, learning_rate_scale, gradient.rows)
+    params.step(
+        gradient.grads, settings, learning_rate_scale, gradient.rows, settings.largest_scale_m(camera)
+    )
     terms["visible"] = float(raster.num_visible)
     return terms

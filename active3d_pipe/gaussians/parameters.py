@@ -13,6 +13,7 @@ from active3d_pipe.structures import Camera, GaussianModel
 MEANS, LOG_SCALES, QUATS = slice(0, 3), slice(3, 6), slice(6, 10)
 OPACITY_LOGITS, COLORS = 10, slice(11, 14)
 WIDTH = 14
+LARGEST_M = 1e3  # standard deviation of a primitive, where no bound is given, m
 GROWTH = 0.05  # share of room that is taken for more when arrays grow
 
 
@@ -38,7 +39,7 @@ class GaussianParameters:
         # Iterations so far, the one that each primitive has come to, and how Adam ran in the last.
         self._now = 0
         self._done = np.zeros(len(values), np.int32)
-        self._adam = (np.zeros(WIDTH, np.float32), np.float32(0), np.float32(0))
+        self._adam = (np.zeros(WIDTH, np.float32), np.float32(0), np.float32(0), np.float32(0))
         self._owing = False
         self._places: np.ndarray | None = None
 
@@ -236,7 +237,7 @@ class GaussianParameters:
 
     def step(
         self, grads: np.ndarray | Tensor, settings: GaussianSettings, learning_rate_scale: float = 1.0,
-        rows: np.ndarray | None = None,
+        rows: np.ndarray | None = None, largest_m: float = LARGEST_M,
     ) -> None:
         """One Adam step with dL/dvalues `grads`.
 
@@ -246,6 +247,7 @@ class GaussianParameters:
             learning_rate_scale: factor on all learning rates (annealing).
             rows: (M,) int32, different primitives that `near` or `rows` gave out since the last step; default all.
                 The gradient of the others is zero.
+            largest_m: standard deviation that none may grow beyond, m.
         """
         grad = grads.numpy() if isinstance(grads, Tensor) else grads
         if rows is None:
@@ -255,7 +257,8 @@ class GaussianParameters:
         rates[MEANS], rates[LOG_SCALES], rates[QUATS] = settings.lr_means_m, settings.lr_log_scales, settings.lr_quats
         rates[OPACITY_LOGITS], rates[COLORS] = settings.lr_opacity_logits, settings.lr_colors
         self._adam = (
-            rates * np.float32(learning_rate_scale), np.float32(settings.adam_beta1), np.float32(settings.adam_beta2)
+            rates * np.float32(learning_rate_scale), np.float32(settings.adam_beta1), np.float32(settings.adam_beta2),
+            np.float32(np.log(largest_m)),
         )
         grad = np.ascontiguousarray(grad, dtype=np.float32)
         kernels_adam.adam(*self._plain(), rows, grad, *self._adam)  # type: ignore[call-arg]

@@ -40,6 +40,24 @@ def test_model_round_trip() -> None:
     assert (params.to_model().colors == 0.25).all()
 
 
+def test_no_primitive_grows_beyond_the_bound_not_even_by_the_steps_that_it_owes() -> None:
+    settings = GaussianSettings()
+    params = GaussianParameters.from_model(wall(20))
+    bound = 1.05 * float(np.exp(params.values.numpy()[:, 3:6].max()))
+    wider = np.zeros((20, 14), np.float32)
+    wider[:, 3:6] = -1e-4  # dL/dlog-scale that makes them grow
+    rows = np.arange(10, dtype=np.int32)
+    for some in (np.arange(20, dtype=np.int32), rows, rows, rows):  # the last ten owe three steps
+        params.step(wider[some], settings, rows=some, largest_m=bound)
+    scales = np.exp(params.values.numpy()[:, 3:6])
+    assert scales.max() <= bound * (1 + 1e-6)
+    assert scales[:, 0].min() > 0.99 * bound  # both kinds came up to it
+    free = GaussianParameters.from_model(wall(20))
+    for _ in range(4):
+        free.step(wider, settings)
+    assert np.exp(free.values.numpy()[:, 3:6]).max() > 1.05 * bound
+
+
 def test_adam_equals_torch_for_every_primitive_whenever_it_was_added() -> None:
     settings = GaussianSettings()
     old, new = wall(20), wall(10, 1)

@@ -1,6 +1,7 @@
 """Spheres, the pull towards them, and seeding one primitive a pixel."""
 
 import numpy as np
+import pytest
 import torch
 
 from active3d_pipe.gaussians.config import GaussianSettings
@@ -95,3 +96,13 @@ def test_silhouette_rule_seeds_where_the_depth_error_stands_out() -> None:
 def test_discs_of_spheres_have_three_equal_scales() -> None:
     one = discs(np.zeros((1, 3)), np.ones((1, 3)), np.ones((1, 3)), np.array([0.1]), 1.0, 0.5)
     np.testing.assert_allclose(np.exp(one.log_scales), 0.1, rtol=1e-6)
+
+
+def test_primitives_may_grow_to_one_and_a_half_times_the_largest_seed() -> None:
+    settings = GaussianSettings()
+    assert settings.largest_scale_m(Camera.from_fov(600, 340, 90.0)) == pytest.approx(1.5 * 0.68 * 0.048)
+    few = Camera.from_fov(60, 34, 90.0)  # far seeds of coarse images are wider than any cell
+    assert settings.largest_scale_m(few) == pytest.approx(1.5 * 0.68 * 10 / 30)
+    pixels = GaussianSettings(seed_method="pixels", seed_stride=2, max_growth=1.0)
+    assert pixels.largest_scale_m(few) == pytest.approx(0.68 * 2 * 10 / 30)
+    assert float(trained(settings, 30).values[:, LOG_SCALES].max()) <= np.log(settings.largest_scale_m(CAMERA)) + 1e-5
