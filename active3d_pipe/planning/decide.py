@@ -90,9 +90,8 @@ def _choose(
     spreading = previous is not None and previous.reason is Reason.SPREAD
     turns = (task.round,) if before < settings.hidden_reward and not spreading else ()
     usual = space
-    searches = _searches(spreading, task.round)
-    best = before if searches[0] == "spread" else 0.0
-    for search in searches:
+    best = before
+    for search in _searches(spreading, task.round):
         if search == "spread":
             decision = _spread(task, volume, usual, field, previous, len(walked), best)
             if decision is not None:
@@ -127,7 +126,8 @@ def _searches(spreading: bool, number: int) -> tuple[str, ...]:
     """
     if not spreading:
         return "quick", "thorough", "relaxed", "spread"
-    return ("quick", "spread", "thorough", "relaxed")[number % ASK_EVERY != 0 :]
+    ask = ("quick",) if number % ASK_EVERY == 0 else ()
+    return *ask, "spread", "thorough", "relaxed"
 
 
 def _spread(

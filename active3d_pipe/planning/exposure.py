@@ -16,8 +16,8 @@ from active3d_pipe.planning.reward import RewardField
 from active3d_pipe.structures.camera import Camera
 from active3d_pipe.structures.voxel_grid import VoxelGrid
 
-# Random views: so many places, so many rays from each. More places rather than more rays of each say what is due; a
-# block of the surface of a large house gets some fifty.
+# Random views: so many places, so many rays from each. More places rather than more rays of each say what is due
+# (docs/findings.md, Planning).
 PLACES, GLANCES = 4000, 50
 
 
