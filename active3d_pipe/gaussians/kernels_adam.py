@@ -2,8 +2,8 @@
 """Numba kernels: Adam over the primitives that an image shows, and the steps that the others owe.
 
 Adam moves a parameter on after its gradient has gone, by its momentum; with momentum cut off for what an image does
-not show, fewer images are fitted well (docs/findings.md). But a primitive that is not looked at need not be moved in
-every iteration: `near` takes all the steps that it owes at once, when it may be seen again.
+not show, fewer images are fitted well (docs/findings/optimisation.md). But a primitive that is not looked at need not
+be moved in every iteration: `near` takes all the steps that it owes at once, when it may be seen again.
 """
 
 import math

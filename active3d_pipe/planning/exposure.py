@@ -17,7 +17,7 @@ from active3d_pipe.structures.camera import Camera
 from active3d_pipe.structures.voxel_grid import VoxelGrid
 
 # Random views: so many places, so many rays from each. More places rather than more rays of each say what is due
-# (docs/findings.md, Planning).
+# (docs/findings/spreading.md).
 PLACES, GLANCES = 4000, 50
 
 
