@@ -1,14 +1,15 @@
 """The field's SDF, replaced by fused depth readings where these contradict it: thin parts that the field washes out."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from active3d_pipe.export import kernels_correction as kernels
 from active3d_pipe.export.config import MeshSettings
 from active3d_pipe.export.view_fusion import dilated, frame_arrays
+from active3d_pipe.geometry.lattice import Points, SdfQuery
 from active3d_pipe.geometry.sampling import spread
-from active3d_pipe.geometry.sensor_noise import noise_at, sensor_noise
+from active3d_pipe.geometry.sensor_noise import noise_at, sensor_noise, typical_noise
 from active3d_pipe.geometry.threads import on_threads
 from active3d_pipe.structures import Frame, VoxelGrid
 
@@ -20,17 +21,17 @@ SURE = 3.0  # standard errors that it must lie off the surface
 SCATTER_M = 0.12  # within which noise shows on both sides of a surface
 BY_NOISE = 5.0  # standard deviations of the sensor's noise up to which it may explain a contradiction
 OTHER_SIDE = 0.2  # share of such a contradiction that may lie on the other side of the surface
-MOST_READINGS = 16  # in a cell, after which further frames are not asked about it
+MOST_READINGS, EXACT_READINGS = 16, 8  # in a cell, after which further frames are not asked about it
+EXACT_M = 0.001  # standard deviation of a sensor's noise under which EXACT_READINGS say as much as more
 
 
 def corrected_sdf(
-    query_sdf: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high: np.ndarray, frames: Sequence[Frame],
-    settings: MeshSettings,
-) -> Callable[[np.ndarray], np.ndarray]:
+    query_sdf: SdfQuery, low: np.ndarray, high: np.ndarray, frames: Sequence[Frame], settings: MeshSettings
+) -> SdfQuery:
     """`query_sdf`, but around readings where it is wrong the truncated signed distance of the readings.
 
     Args:
-        query_sdf: (N, 3) float32 world points, m -> (N,) SDF, m, positive in free space.
+        query_sdf: the SDF to be corrected.
         low, high: (3,) corners of the box, world, m.
         frames: logged frames with depth.
         settings: `dispute_m`, the mean SDF at the readings of a cell of two marching-cubes cells from which they are
@@ -57,8 +58,8 @@ def corrected_sdf(
     near = np.float32(min(f.camera.near for f in fused))
     truncation = np.float32(settings.fusion_truncation_cells * settings.voxel_size_m)
 
-    def query(points: np.ndarray) -> np.ndarray:
-        sdf = query_sdf(points)
+    def query(points: Points) -> np.ndarray:
+        sdf, points = query_sdf(points), np.asarray(points)
         chosen = np.empty(len(points), np.int64)
         chosen = chosen[: kernels.points_in(points, origin, inv_cell, marks, chosen)]
         if len(chosen):
@@ -73,8 +74,7 @@ def corrected_sdf(
 
 
 def _disputed(
-    query_sdf: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high: np.ndarray, frames: Sequence[Frame],
-    settings: MeshSettings,
+    query_sdf: SdfQuery, low: np.ndarray, high: np.ndarray, frames: Sequence[Frame], settings: MeshSettings
 ) -> tuple[VoxelGrid, np.ndarray, list[Frame]]:
     """Grid, the cells (X, Y, Z) bool in and beside which readings contradict, and the frames that do so most."""
     grid = VoxelGrid.from_bounds(low, high, 2 * settings.voxel_size_m)
@@ -83,13 +83,14 @@ def _disputed(
     counts = np.zeros(grid.shape, np.int32)
     compared = spread(frames, MOST_FRAMES)
     sensor = sensor_noise(compared)
+    most = EXACT_READINGS if typical_noise(sensor, compared) < EXACT_M else MOST_READINGS
     against = np.zeros(len(compared), np.int64)
     for index in _scattered(len(compared)):
         frame = compared[index]
         points = np.empty((frame.depth[::STRIDE, ::STRIDE].size, 3), np.float32)
         reach = np.array([frame.camera.near, frame.camera.far], np.float32)
         points = points[: kernels.open_readings(
-            *frame_arrays(frame), frame.depth, STRIDE, reach, origin, inv_cell, counts, MOST_READINGS, points
+            *frame_arrays(frame), frame.depth, STRIDE, reach, origin, inv_cell, counts, most, points
         )]
         if len(points):
             values = query_sdf(points)

@@ -1,16 +1,14 @@
 """The zero level of the SDF as a triangle mesh: blocked, coarse to fine, only where surface was observed."""
 
-from collections.abc import Callable
-
 import numpy as np
 from scipy.ndimage import binary_dilation
 
 from active3d_pipe.errors import ConfigError, InputError
 from active3d_pipe.export import kernels_marching as kernels
 from active3d_pipe.export.config import MeshSettings
+from active3d_pipe.geometry.lattice import LatticePoints, SdfQuery
 from active3d_pipe.structures import TriangleMesh, VoxelGrid
 
-QuerySdf = Callable[[np.ndarray], np.ndarray]
 UNKNOWN = np.float32(1e3)  # SDF of nodes that no marked cell has
 
 
@@ -23,7 +21,7 @@ def near_surface(hit_evidence: np.ndarray, dilate_voxels: int) -> np.ndarray:
 
 
 def extract_mesh(
-    query_sdf: QuerySdf,
+    query_sdf: SdfQuery,
     low: np.ndarray,
     high: np.ndarray,
     settings: MeshSettings,
@@ -34,7 +32,7 @@ def extract_mesh(
     """Marching cubes over the box [low, high].
 
     Args:
-        query_sdf: (N, 3) float32 world points -> (N,) SDF, m, positive in free space.
+        query_sdf: SDF, asked at nodes of lattices of one block each.
         low, high: (3,) corners of the box, world, m.
         settings: cell size and block size; see `MeshSettings`.
         grid, observed: a voxel grid and a bool volume on it (`near_surface`, `near_readings`); outside of it no
@@ -89,7 +87,7 @@ def _observed_cells(
 
 
 def _block(
-    query_sdf: QuerySdf, low: np.ndarray, base: np.ndarray, coarse: np.ndarray, settings: MeshSettings
+    query_sdf: SdfQuery, low: np.ndarray, base: np.ndarray, coarse: np.ndarray, settings: MeshSettings
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Vertices (V, 3) float64 in lattice units, their keys (V, 4) and faces of one block; None if it is empty."""
     size = settings.voxel_size_m
@@ -119,14 +117,15 @@ def _blank(cells: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _evaluate(
-    query_sdf: QuerySdf, cells: np.ndarray, low: np.ndarray, base: np.ndarray, step: int, size: float,
+    query_sdf: SdfQuery, cells: np.ndarray, low: np.ndarray, base: np.ndarray, step: int, size: float,
     sdf: np.ndarray, known: np.ndarray,
 ) -> None:
     """SDF at the nodes of the marked cells that are not known yet."""
-    nodes, points = np.empty(sdf.size, np.int64), np.empty((sdf.size, 3), np.float32)
-    count = kernels.gather_nodes(cells, known, low, base, step, size, nodes, points)
-    if count:
-        sdf.reshape(-1)[nodes[:count]] = query_sdf(points[:count])
+    nodes = np.empty(sdf.size, np.int64)
+    nodes = nodes[: kernels.gather_nodes(cells, known, nodes)]
+    if len(nodes):
+        x, y, z = (low[d] + (base[d] + step * np.arange(sdf.shape[d])) * size for d in range(3))
+        sdf.reshape(-1)[nodes] = query_sdf(LatticePoints((x, y, z), nodes))
 
 
 def _weld(mesh: TriangleMesh, keys: np.ndarray, block: int) -> TriangleMesh:

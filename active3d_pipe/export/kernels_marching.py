@@ -59,12 +59,11 @@ EDGE_AXIS = np.array([0] * 4 + [1] * 4 + [2] * 4, np.int32)
 
 
 @njit(cache=True)
-def gather_nodes(cells, known, low, base, step, size, nodes, points):
-    """Nodes of the marked cells that are not known yet, and their world positions; returns their number.
+def gather_nodes(cells, known, nodes):
+    """Flat indices of the nodes of the marked cells that are not known yet; returns their number.
 
-    cells (X, Y, Z) bool; known (X + 1, Y + 1, Z + 1) bool, set for every node that is returned; low (3,) float64 m;
-    base (3,) int64 lattice index of node 0, `step` lattice units a cell, `size` m a unit; nodes (N,) int64 flat
-    indices and points (N, 3) float32 are filled.
+    cells (X, Y, Z) bool; known (X + 1, Y + 1, Z + 1) bool, set for every node that is returned; nodes (N,) int64 is
+    filled.
     """
     count = 0
     ny, nz = known.shape[1], known.shape[2]
@@ -79,9 +78,6 @@ def gather_nodes(cells, known, low, base, step, size, nodes, points):
                         continue
                     known[x, y, z] = True
                     nodes[count] = (x * ny + y) * nz + z
-                    points[count, 0] = low[0] + (base[0] + step * x) * size
-                    points[count, 1] = low[1] + (base[1] + step * y) * size
-                    points[count, 2] = low[2] + (base[2] + step * z) * size
                     count += 1
     return count
 

@@ -1,17 +1,17 @@
 """What the logged frames contribute to the mesh: where surface was read, which faces were seen, their colours."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from active3d_pipe.export import kernels_views as kernels
 from active3d_pipe.export.config import MeshSettings
-from active3d_pipe.export.isosurface import QuerySdf, keep_faces
+from active3d_pipe.export.isosurface import keep_faces
 from active3d_pipe.geometry.sampling import spread
 from active3d_pipe.geometry.threads import on_threads
 from active3d_pipe.structures import Frame, TriangleMesh, VoxelGrid
 
-QueryColor = QuerySdf
+QueryColor = Callable[[np.ndarray], np.ndarray]
 READING_STRIDE = 4  # of the pixels, every how many mark their cell; the lines between them close the gaps
 JOIN = 0.1  # neighbouring readings belong to one surface when they differ by less than this share of the depth
 MIN_COSINE = 0.15  # colours are taken from views that see the surface at this cosine or better

@@ -23,7 +23,7 @@ F0, F1, HALF = np.float32(0), np.float32(1), np.float32(0.5)
 C3, C5, C15_16 = np.float32(2 / 3), np.float32(0.2), np.float32(15 / 16)
 CHUNK = 128
 GRID_SLABS = 4
-ONE = np.uintp(1)
+ONE, TWO, THREE = np.uintp(1), np.uintp(2), np.uintp(3)
 
 
 @njit(inline="always", fastmath=True)
@@ -184,69 +184,80 @@ def decode_points(
     out (N, outputs); hidden is a multiple of 8, channels of 8, grid channels of 4. At most three bins of an axis are
     not zero, so OneBlob costs nine rows of w1, not 3 bins.
     """
-    n, hidden, outputs = points.shape[0], w1.shape[1], w2.shape[0]
-    channels = planes.shape[1]
-    nx, ny, nz, grid_channels = grid.shape
-    width = (layout[-1, 5] + 1) * channels
+    n, hidden, outputs = points.shape[0], np.uintp(w1.shape[1]), np.uintp(w2.shape[0])
+    channels, grid_channels = np.uintp(planes.shape[1]), np.uintp(grid.shape[3])
+    nx, ny, nz = grid.shape[:3]
+    width = np.uintp(layout[-1, 5] + 1) * channels
     fbins = np.float32(bins)
     chunks = (n + CHUNK - 1) // CHUNK
-    for k in prange(chunks):
+    for part in prange(chunks):
         h = np.empty(hidden, np.float32)
         f = np.empty(width + grid_channels, np.float32)
-        for p in range(k * CHUNK, min(n, (k + 1) * CHUNK)):
+        for p in range(part * CHUNK, min(n, (part + 1) * CHUNK)):
+            p = np.uintp(p)
             for c in range(width + grid_channels):
-                f[c] = F0
-            for q in range(layout.shape[0]):
+                f[np.uintp(c)] = F0
+            for q in range(np.uintp(layout.shape[0])):
+                q = np.uintp(q)
                 nb = layout[q, 2]
-                a, b = layout[q, 3], layout[q, 4]
+                a, b = np.uintp(layout[q, 3]), np.uintp(layout[q, 4])
                 i, fa = _cell(points[p, a] - low[a], inv_res[q], layout[q, 6], layout[q, 1])
                 j, fb = _cell(points[p, b] - low[b], inv_res[q], layout[q, 7], nb)
-                node = layout[q, 0] + i * nb + j
+                n00 = np.uintp(layout[q, 0] + i * nb + j)
+                n10 = n00 + np.uintp(nb)
+                n01, n11 = n00 + ONE, n10 + ONE
                 w11 = fa * fb
                 w10 = fa - w11
                 w01 = fb - w11
                 w00 = F1 - fa - fb + w11
-                o = np.uintp(layout[q, 5] * channels)
-                n00, n10 = np.uintp(node), np.uintp(node + nb)
-                n01, n11 = n00 + ONE, n10 + ONE
+                o = np.uintp(layout[q, 5]) * channels
                 for c in range(channels):
-                    f[o + np.uintp(c)] += (
+                    c = np.uintp(c)
+                    f[o + c] += (
                         w00 * planes[n00, c] + w01 * planes[n01, c] + w10 * planes[n10, c] + w11 * planes[n11, c]
                     )
             i, fx = _cell(points[p, 0] - low[0], inv_grid, grid_first[0], nx)
             j, fy = _cell(points[p, 1] - low[1], inv_grid, grid_first[1], ny)
             m, fz = _cell(points[p, 2] - low[2], inv_grid, grid_first[2], nz)
-            for di in range(2):
+            i, j, m = np.uintp(i), np.uintp(j), np.uintp(m)
+            for di in range(np.uintp(2)):
                 wx = fx if di else F1 - fx
-                for dj in range(2):
+                for dj in range(np.uintp(2)):
                     wxy = wx * (fy if dj else F1 - fy)
-                    for dk in range(2):
-                        w = wxy * (fz if dk else F1 - fz)
-                        for c in range(grid_channels):
-                            f[width + c] += w * grid[i + di, j + dj, m + dk, c]
+                    below, above = wxy * (F1 - fz), wxy * fz
+                    ii, jj = i + np.uintp(di), j + np.uintp(dj)
+                    for c in range(grid_channels):
+                        c = np.uintp(c)
+                        f[width + c] += below * grid[ii, jj, m, c] + above * grid[ii, jj, m + ONE, c]
 
             for c in range(hidden):
+                c = np.uintp(c)
                 h[c] = b1[c]
             # Several rows at a time: adding to h is a chain of loads and stores, each waiting for the one before.
-            for a in range(3):
-                x = (points[p, a] - blob_low[a]) * inv_extent[a]
+            for axis in range(3):
+                x = (points[p, axis] - blob_low[axis]) * inv_extent[axis]
                 x = min(max(x, F0), F1) * fbins
                 j = min(max(np.int64(x) - 1, 0), bins - 2)
                 e0, e1 = _quartic_cdf(np.float32(j) - x), _quartic_cdf(np.float32(j + 1) - x)
                 e2, e3 = _quartic_cdf(np.float32(j + 2) - x), _quartic_cdf(np.float32(j + 3) - x)
-                v0, v1, row = e1 - e0, e2 - e1, a * bins + j
-                v2, last = (e3 - e2, row + 2) if j + 2 < bins else (F0, row + 1)
+                v0, v1, row = e1 - e0, e2 - e1, np.uintp(axis * bins + j)
+                v2, last = (e3 - e2, row + TWO) if j + 2 < bins else (F0, row + ONE)
                 for c in range(hidden):
-                    h[c] += v0 * w1[row, c] + v1 * w1[row + 1, c] + v2 * w1[last, c]
-            for r in range(0, width + grid_channels, 4):
-                v0, v1, v2, v3 = f[r], f[r + 1], f[r + 2], f[r + 3]
-                row = 3 * bins + r
+                    c = np.uintp(c)
+                    h[c] += v0 * w1[row, c] + v1 * w1[row + ONE, c] + v2 * w1[last, c]
+            for r in range(np.uintp(0), width + grid_channels, np.uintp(4)):
+                r = np.uintp(r)
+                v0, v1, v2, v3 = f[r], f[r + ONE], f[r + TWO], f[r + THREE]
+                row = np.uintp(3 * bins) + r
                 for c in range(hidden):
-                    h[c] += v0 * w1[row, c] + v1 * w1[row + 1, c] + v2 * w1[row + 2, c] + v3 * w1[row + 3, c]
+                    c = np.uintp(c)
+                    h[c] += (
+                        v0 * w1[row, c] + v1 * w1[row + ONE, c] + v2 * w1[row + TWO, c] + v3 * w1[row + THREE, c]
+                    )
             for o in range(outputs):
+                o = np.uintp(o)
                 s = b2[o]
                 for c in range(hidden):
+                    c = np.uintp(c)
                     s += max(h[c], F0) * w2[o, c]
                 out[p, o] = s
-
-

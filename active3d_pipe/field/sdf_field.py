@@ -11,7 +11,9 @@ from active3d_pipe.field import kernels
 from active3d_pipe.field.config import FieldSettings
 from active3d_pipe.field.encoders import Planes, make_encoders
 from active3d_pipe.field.encoding import BlobLayout, EncodeGrid, check_memory, lowest_nodes, node_counts
+from active3d_pipe.field.fused_decoder import FusedDecoder
 from active3d_pipe.field.normals import unit_gradients
+from active3d_pipe.geometry.lattice import LatticePoints, Points
 
 
 class FieldSamples(NamedTuple):
@@ -149,35 +151,26 @@ class SdfField(torch.nn.Module):
         h = torch.addmm(h, features, self.color_feature_weight)
         return torch.sigmoid(torch.addmm(self.color_bias, torch.relu(h), self.color_weight))
 
-    def _decode(self, points: np.ndarray, with_sigma: bool) -> np.ndarray:
-        """(N, 1 or 2) raw SDF and sigma before its softplus; tri-planes with V_alpha have a fused kernel for it."""
-        hidden, encoder = self.settings.hidden, self.encoder
-        points = _as_points(points)
-        if not isinstance(encoder, Planes) or not self.settings.grid_channels:
-            return self._decode_by_parts(points, with_sigma)
-        blob, feature, bias, w_geometry, w_sigma, b_geometry, b_sigma = (
+    def _decode(self, points: Points, with_sigma: bool) -> np.ndarray:
+        """(N, 1 or 2) raw SDF and sigma before its softplus; tri-planes with V_alpha have fused kernels for it."""
+        if not isinstance(points, LatticePoints):
+            points = _as_points(points)
+        if not isinstance(self.encoder, Planes) or not self.settings.grid_channels:
+            return self._decode_by_parts(np.asarray(points), with_sigma)
+        planes, grid, blob, feature, bias, *layers = (
             p.detach().numpy() for p in (
-                self.blob_weight, self.feature_weight, self.bias, self.geometry_weight, self.sigma_weight,
-                self.geometry_bias, self.sigma_bias,
+                self.planes, self.grid, self.blob_weight, self.feature_weight, self.bias, self.geometry_weight,
+                self.sigma_weight, self.geometry_bias, self.sigma_bias,
             )
         )
-        columns = 2 * hidden if with_sigma else hidden
-        w1 = np.zeros((len(blob) + len(feature), columns), np.float32)
-        w1[: len(blob), :hidden] = blob
-        w1[len(blob) :] = feature[:, :columns]
-        w2 = np.zeros((2 if with_sigma else 1, columns), np.float32)
-        w2[0, :hidden] = w_geometry[:, 0]
-        b2 = np.zeros(len(w2), np.float32)
-        b2[0] = b_geometry[0]
-        if with_sigma:
-            w2[1, hidden:], b2[1] = w_sigma[:, 0], b_sigma[0]
-        out = np.empty((len(points), len(w2)), np.float32)
-        kernels.decode_points(
-            points, self._origin, self.blob.low, self.blob.inv_extent, self.blob.bins, self.planes.detach().numpy(),
-            encoder.layout.rows, encoder.layout.inv_resolution, self.grid_first, self.grid.detach().numpy(),
-            self._inv_grid, w1, np.ascontiguousarray(bias[:columns]), w2, b2, out,
-        )
-        return out
+        outputs = 2 if with_sigma else 1
+        columns = outputs * self.settings.hidden
+        return FusedDecoder(
+            self._origin, self.blob, self.encoder.layout, planes, grid, self.grid_first, self._inv_grid, blob,
+            np.ascontiguousarray(feature[:, :columns]), bias[:columns],
+            np.concatenate([layers[0][:, 0], layers[1][:, 0]])[:columns],
+            np.concatenate([layers[2][:1], layers[3]])[:outputs],
+        ).at(points)
 
     def _decode_by_parts(self, points: np.ndarray, with_sigma: bool, batch: int = 65536) -> np.ndarray:
         out = np.empty((len(points), 2 if with_sigma else 1), np.float32)
@@ -189,12 +182,15 @@ class SdfField(torch.nn.Module):
                     out[i : i + batch, 1] = raw_sigma.numpy()
         return out
 
-    def query_sdf(self, points: np.ndarray) -> np.ndarray:
-        """(N,) float32 SDF in m at world points (N, 3), cut at +-truncation. About 2.5 M points a second."""
+    def query_sdf(self, points: Points) -> np.ndarray:
+        """(N,) float32 SDF in m at world points (N, 3), cut at +-truncation.
+
+        Some 3 M points a second, 10 M of a lattice.
+        """
         sdf = self._decode(points, with_sigma=False)[:, 0]
         return np.clip(sdf, -1, 1) * np.float32(self.truncation_m)
 
-    def query_geometry(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def query_geometry(self, points: Points) -> tuple[np.ndarray, np.ndarray]:
         """(sdf, sigma), both (N,) float32 m, at world points (N, 3)."""
         raw = self._decode(points, with_sigma=True)
         sigma = np.logaddexp(0, raw[:, 1]) * np.float32(self.truncation_m) + np.float32(self.settings.sigma_floor_m)
@@ -271,5 +267,5 @@ class SdfField(torch.nn.Module):
         self.visits = arrays["visits"].copy()
 
 
-def _as_points(points: np.ndarray) -> np.ndarray:
+def _as_points(points: Points) -> np.ndarray:
     return np.ascontiguousarray(points, dtype=np.float32).reshape(-1, 3)

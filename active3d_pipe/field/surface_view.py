@@ -6,9 +6,11 @@ import numpy as np
 
 from active3d_pipe.field import kernels_trace
 from active3d_pipe.geometry import projection
+from active3d_pipe.geometry.lattice import LatticePoints, Points
 from active3d_pipe.structures import Camera
 
 SPACING_M = 0.05  # of the nodes on which the SDF is sampled for the search along rays
+SLAB = 16  # planes of nodes that are asked at a time, which bounds the memory
 POLISH = 3  # steps with the SDF itself that bring a found depth onto its zero level
 
 
@@ -18,7 +20,7 @@ class Surface(Protocol):
     low: np.ndarray
     high: np.ndarray
 
-    def query_sdf(self, points: np.ndarray) -> np.ndarray:
+    def query_sdf(self, points: Points) -> np.ndarray:
         """(N,) SDF, m, at world points (N, 3)."""
 
     def query_color(self, points: np.ndarray) -> np.ndarray:
@@ -37,10 +39,10 @@ class SurfaceView:
         nodes = np.maximum(np.ceil((surface.high - surface.low) / SPACING_M).astype(int) + 1, 2)
         axes = [surface.low[a] + np.float32(SPACING_M) * np.arange(nodes[a], dtype=np.float32) for a in range(3)]
         sdf = np.empty(tuple(nodes), np.float32)
-        for i, x in enumerate(axes[0]):  # a slice at a time bounds the memory
-            points = np.empty((nodes[1], nodes[2], 3), np.float32)
-            points[..., 0], points[..., 1], points[..., 2] = x, axes[1][:, None], axes[2][None]
-            sdf[i] = surface.query_sdf(points.reshape(-1, 3)).reshape(nodes[1], nodes[2])
+        for i in range(0, nodes[0], SLAB):
+            part = sdf[i : i + SLAB]
+            points = LatticePoints((axes[0][i : i + SLAB], axes[1], axes[2]), np.arange(part.size))
+            part[:] = surface.query_sdf(points).reshape(part.shape)
         self._sdf = sdf
 
     def render(self, camera: Camera, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

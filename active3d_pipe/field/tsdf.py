@@ -10,6 +10,7 @@ from active3d_pipe.field.config import TsdfSettings
 from active3d_pipe.field.encoding import check_memory
 from active3d_pipe.field.normals import unit_gradients
 from active3d_pipe.geometry import se3
+from active3d_pipe.geometry.lattice import Points
 from active3d_pipe.structures import Frame
 
 MARK_STRIDE = 2  # px between the readings that allocate blocks; a block is many pixels wide
@@ -95,23 +96,23 @@ class TsdfField:
         fresh = np.zeros((len(new), kernels.BLOCK**3, WIDTH), np.float32)
         self._values = np.concatenate([self._values, fresh])
 
-    def _interpolate(self, points: np.ndarray) -> np.ndarray:
+    def _interpolate(self, points: Points) -> np.ndarray:
         """(N, 5) tsdf in truncations, weight, r, g, b at world points (N, 3)."""
         points = np.ascontiguousarray(points, np.float32).reshape(-1, 3)
         out = np.empty((len(points), 5), np.float32)
         kernels.interpolate(points, self._origin, np.float32(self.settings.voxel_m), self._index, self._values, out)
         return out
 
-    def query_sdf(self, points: np.ndarray) -> np.ndarray:
+    def query_sdf(self, points: Points) -> np.ndarray:
         """(N,) float32 SDF in m at world points (N, 3), cut at +-truncation."""
         return self._interpolate(points)[:, 0] * np.float32(self.truncation_m)
 
-    def query_fused(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def query_fused(self, points: Points) -> tuple[np.ndarray, np.ndarray]:
         """(sdf, m, and how many readings it is the mean of), both (N,) float32, at world points (N, 3)."""
         found = self._interpolate(points)
         return found[:, 0] * np.float32(self.truncation_m), found[:, 1]
 
-    def query_geometry(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def query_geometry(self, points: Points) -> tuple[np.ndarray, np.ndarray]:
         """(sdf, sigma), both (N,) float32 m, at world points (N, 3)."""
         found = self._interpolate(points)
         weight = found[:, 1]

@@ -9,6 +9,7 @@ from active3d_pipe.structures import Frame
 
 MOST_FRAMES = 100  # evenly spread, that are asked
 ROW_STRIDE = 16  # rows of an image, every how many are asked
+DEPTH_FRAMES, DEPTH_STRIDE = 50, 8  # evenly spread, and every how many pixels: how far readings are, as a rule
 FROM_MEDIAN = 1 / (0.6745 * 6**0.5)  # standard deviation of a reading by the median of |a - 2 b + c|
 
 
@@ -32,6 +33,14 @@ def sensor_noise(frames: Sequence[Frame]) -> np.ndarray:
     for metre in np.unique(near):
         out[metre] = np.median(error[near == metre]) * FROM_MEDIAN
     return out
+
+
+def typical_noise(noise: np.ndarray, frames: Sequence[Frame]) -> float:
+    """Standard deviation, m, of the median reading of `frames`, from what `sensor_noise` found; 0 without readings."""
+    some = spread(frames, DEPTH_FRAMES)
+    depths = np.concatenate([np.zeros(0), *(f.depth[::DEPTH_STRIDE, ::DEPTH_STRIDE].ravel() for f in some)])
+    depths = depths[depths > 0]
+    return float(np.median(noise_at(noise, depths))) if len(depths) else 0.0
 
 
 def noise_at(noise: np.ndarray, depth: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from active3d_pipe.errors import InputError, NumericalError
+from active3d_pipe.geometry.lattice import LatticePoints, Points
 from active3d_pipe.information.gain import entropy_drop
 from active3d_pipe.structures import Frame, GaussianModel, UncertaintyVolume, VoxelGrid
 from active3d_pipe.uncertainty import explicit, fusion, kernels, occupancy
@@ -14,7 +15,7 @@ from active3d_pipe.uncertainty.config import UncertaintySettings
 from active3d_pipe.uncertainty.explicit import ViewResidual
 from active3d_pipe.uncertainty.terms import due_to_the_field, open_to_the_field, voxel_terms
 
-FieldQuery = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+FieldQuery = Callable[[Points], tuple[np.ndarray, np.ndarray]]
 
 
 def make_grid(low: np.ndarray, high: np.ndarray, settings: UncertaintySettings) -> VoxelGrid:
@@ -45,7 +46,7 @@ def compute_volume(  # noqa: PLR0913  (the inputs of the stage, by name)
     Args:
         grid: of every volume; `previous` must be on the same one.
         previous: volume of the last round, None in the first: it carries the evidence and the fusion statistics.
-        field_query: world points (N, 3) float32, m -> (sdf, sigma), (N,) each, m. Asked where it matters
+        field_query: world points (N, 3), m -> (sdf, sigma), (N,) each, m. Asked where it matters
             (`open_to_the_field`) and may have changed (`due_to_the_field`); elsewhere the SDF stays what it was.
         gaussians: the explicit branch of this round's map.
         new_frames: frames captured since `previous`.
@@ -136,7 +137,7 @@ def _query(
     """SDF and sigma at the centres of the voxels in `mask`, m, elsewhere those of `previous`; without one, of all."""
     if previous is None:
         mask = np.ones(grid.shape, bool)
-    points = np.stack([grid.axis(i).astype(np.float32)[at] for i, at in enumerate(np.nonzero(mask))], axis=-1)
+    points = LatticePoints((grid.axis(0), grid.axis(1), grid.axis(2)), np.flatnonzero(mask))
     values = field_query(points)
     out = []
     for name, value in zip(("sdf", "sigma"), values, strict=True):

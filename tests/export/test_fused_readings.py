@@ -5,8 +5,9 @@ import pytest
 
 from active3d_pipe.export import fused_readings
 from active3d_pipe.export.config import MeshSettings
-from active3d_pipe.export.fused_readings import fused_if_noisy, typical_noise
+from active3d_pipe.export.fused_readings import fused_if_noisy
 from active3d_pipe.geometry import projection, se3
+from active3d_pipe.geometry.sensor_noise import sensor_noise, typical_noise
 from active3d_pipe.structures import Camera, Frame
 
 CAMERA = Camera.from_fov(120, 90, 70.0, far=8)
@@ -33,7 +34,7 @@ def biased(points: np.ndarray) -> np.ndarray:
 
 def test_noisy_readings_outvote_the_field_where_there_are_many() -> None:
     noisy = frames(0.02)
-    assert typical_noise(noisy) == pytest.approx(0.02, rel=0.1)
+    assert typical_noise(sensor_noise(noisy), noisy) == pytest.approx(0.02, rel=0.1)
     query = fused_if_noisy(biased, LOW, HIGH, noisy, SETTINGS)
     at_wall = np.random.default_rng(0).uniform([-0.4, WALL_Y, -0.4], [0.4, WALL_Y, 0.4], (500, 3)).astype(np.float32)
     assert np.abs(query(at_wall)).mean() < 0.004  # the field says 1 cm, one reading 2 cm
@@ -42,7 +43,8 @@ def test_noisy_readings_outvote_the_field_where_there_are_many() -> None:
 
 
 def test_exact_or_few_readings_leave_the_field_alone() -> None:
-    assert typical_noise(frames(0.0)) < 1e-4
+    exact = frames(0.0)
+    assert typical_noise(sensor_noise(exact), exact) < 1e-4
     assert fused_if_noisy(biased, LOW, HIGH, frames(0.0), SETTINGS) is biased
     assert fused_if_noisy(biased, LOW, HIGH, [], SETTINGS) is biased
     never = SETTINGS.model_copy(update={"fuse_noise_m": 0.0})
@@ -61,4 +63,4 @@ def test_without_a_reading_there_is_no_noise() -> None:
     nothing = frames(0.02, count=2)
     for frame in nothing:
         frame.depth[:] = 0
-    assert typical_noise(nothing) == 0.0
+    assert typical_noise(sensor_noise(nothing), nothing) == 0.0

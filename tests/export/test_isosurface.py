@@ -51,7 +51,7 @@ def test_ball_is_accurate_closed_and_turned_outwards(ball):
 
 def test_a_room_is_turned_inwards():
     def room(points):
-        return (0.4 - np.abs(points).max(axis=1)).astype(np.float32)
+        return (0.4 - np.abs(np.asarray(points)).max(axis=1)).astype(np.float32)
 
     normal, centroid = normals_of(extract_mesh(room, LOW, HIGH, SETTINGS))
     assert ((normal * centroid).sum(axis=1) < 0).mean() > 0.999
@@ -113,7 +113,7 @@ def test_any_signs_give_a_surface_without_cracks():
     values[[0, 1, -2, -1]] = values[:, [0, 1, -2, -1]] = values[:, :, [0, 1, -2, -1]] = 1
 
     def noise(points):
-        return 0.01 * values[tuple(np.rint((points + 0.5) * 40).astype(int).T)]
+        return 0.01 * values[tuple(np.rint((np.asarray(points) + 0.5) * 40).astype(int).T)]
 
     mesh = extract_mesh(noise, LOW, HIGH, SETTINGS.model_copy(update={"min_component_m2": 0.0}))
     assert len(mesh.faces) > 1e5 and (edges_by_count(mesh.faces) % 2 == 0).all()
@@ -121,7 +121,7 @@ def test_any_signs_give_a_surface_without_cracks():
 
 def test_small_pieces_are_dropped():
     def two(points):
-        speck = np.linalg.norm(points - [0.42, 0.42, 0.42], axis=1) - 0.03
+        speck = np.linalg.norm(np.asarray(points) - [0.42, 0.42, 0.42], axis=1) - 0.03
         return np.minimum(ball_sdf(points), speck).astype(np.float32)
 
     whole = extract_mesh(two, LOW, HIGH, SETTINGS.model_copy(update={"min_component_m2": 0.0}))
@@ -149,7 +149,7 @@ def test_bad_input():
 
 def test_areas_of_pieces_are_those_of_their_faces():
     def two(points):
-        balls = [np.linalg.norm(points - [x, 0, 0], axis=1) - r for x, r in ((-0.2, 0.15), (0.3, 0.1))]
+        balls = [np.linalg.norm(np.asarray(points) - [x, 0, 0], axis=1) - r for x, r in ((-0.2, 0.15), (0.3, 0.1))]
         return np.minimum(*balls).astype(np.float32)
 
     mesh = extract_mesh(two, LOW, HIGH, SETTINGS.model_copy(update={"min_component_m2": 0.0}))

@@ -6,6 +6,7 @@ import torch
 
 from active3d_pipe.field import kernels
 from active3d_pipe.field.encoding import EncodeGrid, EncodePlanes, PlaneLayout, node_counts
+from active3d_pipe.geometry.lattice import LatticePoints
 
 EXTENT = np.array([1.0, 0.7, 0.5])
 LOW = np.array([-0.3, 0.2, 1.0], np.float32)
@@ -107,6 +108,33 @@ def test_fused_decoder_equals_the_differentiable_path(make_field, small):
     np.testing.assert_allclose(sdf, expected, atol=2e-6)
     np.testing.assert_allclose(field.query_sdf(p), expected, atol=2e-6)
     np.testing.assert_allclose(sigma, g.sigma.detach().numpy() * field.truncation_m, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("hidden", "grid_channels"), [(32, 4), (16, 8)])
+def test_lattice_decoder_equals_the_differentiable_path(make_field, small, hidden, grid_channels):
+    field = make_field(small.model_copy(update={"hidden": hidden, "grid_channels": grid_channels}))
+    rng = np.random.default_rng(0)
+    with torch.no_grad():
+        for p in (field.grid, field.planes, field.geometry_weight, field.sigma_weight):
+            p += torch.from_numpy(rng.normal(scale=0.5, size=tuple(p.shape)).astype(np.float32))
+        field.bias += torch.from_numpy(rng.normal(size=2 * hidden).astype(np.float32))
+    axes = tuple(
+        np.sort(rng.uniform(field.low[d] - 0.2, field.high[d] + 0.2, n)).astype(np.float32)
+        for d, n in enumerate((13, 9, 11))
+    )
+    lattice = LatticePoints(axes, rng.choice(13 * 9 * 11, 500, replace=False))
+    p = np.asarray(lattice)
+    g = field.geometry(p)
+    expected = g.sdf.detach().numpy().clip(-1, 1) * field.truncation_m
+    assert expected.std() > 0.03
+    sdf, sigma = field.query_geometry(lattice)
+    np.testing.assert_allclose(sdf, expected, atol=2e-6)
+    np.testing.assert_allclose(field.query_sdf(lattice), expected, atol=2e-6)
+    assert g.sigma.std() > 0.1
+    np.testing.assert_allclose(sigma, g.sigma.detach().numpy() * field.truncation_m, rtol=1e-4)
+    # A node has the same value whichever others are asked for.
+    some = rng.random(500) < 0.1
+    assert np.array_equal(field.query_sdf(lattice[some]), field.query_sdf(lattice)[some])
 
 
 def test_backward_has_the_same_bits_for_any_number_of_threads():

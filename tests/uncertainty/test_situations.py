@@ -78,6 +78,7 @@ def test_f_h_phantom_structure_behind_the_walls_draws_no_attention(looked_around
     """(f, h) the field invents a second room behind the wall: no view is worth more for it."""
 
     def phantom(points, beyond=SIZE[0] + 0.06):
+        points = np.asarray(points)
         sdf, sigma = field(points)
         behind = points[:, 0] > beyond
         return np.where(behind, 0.05 * np.sin(40 * points[:, 1]), sdf), np.where(behind, 0.3, sigma)

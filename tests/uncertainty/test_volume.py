@@ -145,6 +145,7 @@ def test_phantom_structure_in_seen_free_space_draws_no_attention(seen):
     slab = np.abs(CENTRES[..., 0] - 1.5) < 0.12
 
     def phantom(points):
+        points = np.asarray(points)
         sdf, sigma = field(points)
         inside = np.abs(points[:, 0] - 1.5) < 0.12
         return np.where(inside, -0.05, sdf), np.where(inside, 0.5, sigma)
