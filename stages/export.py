@@ -46,4 +46,4 @@ def _run(context: StageContext) -> None:
     context.notes.update(numbers)
 
 
-STAGE = Stage(name="export", version=18, config=("mapping", "export"), inputs=_inputs, run=_run, loop=False)
+STAGE = Stage(name="export", version=19, config=("mapping", "export"), inputs=_inputs, run=_run, loop=False)

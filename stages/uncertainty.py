@@ -112,6 +112,6 @@ def _write_surface(context: StageContext, hybrid: "HybridMap", volume: "Uncertai
 
 
 STAGE = Stage(
-    name="uncertainty", version=12, config=("uncertainty", "mapping", "export.preview_voxel_m"),
+    name="uncertainty", version=13, config=("uncertainty", "mapping", "export.preview_voxel_m"),
     inputs=_inputs, run=_run, loop=True,
 )
