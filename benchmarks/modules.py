@@ -11,6 +11,7 @@ import json
 import resource
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import active3d_pipe  # noqa: F401  sets how threads wait, before torch
@@ -28,6 +29,7 @@ from active3d_pipe.field.sdf_field import SdfField
 from active3d_pipe.gaussians.raster_pass import RasterPass
 from active3d_pipe.gaussians.reference import render_reference
 from active3d_pipe.geometry import se3
+from active3d_pipe.geometry.lattice import LatticePoints
 from active3d_pipe.structures import Camera, Frame
 
 THREADS = 2
@@ -187,6 +189,23 @@ def measure_field() -> list[list[str]]:
              f"{t['plain'] / t['ours']:.1f} x"]]
 
 
+def measure_queries() -> list[list[str]]:
+    """SDF at nodes of a lattice: all at once, as marching cubes asks, against the same points one by one."""
+    field = SdfField(np.full(3, -0.2), np.array([6.2, 5.2, 3.2]), FieldSettings(), torch.Generator().manual_seed(0))
+    axes = [(x + 0.02 * np.arange(65)).astype(np.float32) for x in (2.0, 2.0, 1.0)]
+    rows, rng = [], np.random.default_rng(3)
+    for name, share in (("all", 1.0), ("a tenth", 0.1)):
+        nodes = LatticePoints((axes[0], axes[1], axes[2]), np.flatnonzero(rng.random(65**3) < share))
+        points = np.asarray(nodes)
+        parts = {"nodes": partial(field.query_sdf, nodes), "points": partial(field.query_sdf, points)}
+        t = {part: 1e9 * s / len(nodes) for part, s in interleaved(parts, dict.fromkeys(parts, 12)).items()}
+        rows.append([
+            f"SDF at {name} of the nodes of a block of 64 cells", f"{t['nodes']:.0f} ns a node",
+            f"{t['points']:.0f} ns (ours, point by point)", f"{t['points'] / t['nodes']:.1f} x",
+        ])
+    return rows
+
+
 LOOP = ("capture", "mapping", "uncertainty", "planning")
 
 
@@ -237,7 +256,7 @@ def main() -> None:
     parser.add_argument("--no-write", action="store_true", help="print only; docs/performance.md stays as it is")
     given = parser.parse_args()
     torch.set_num_threads(THREADS)
-    rows = [*measure_rasteriser(), *gradient_errors(), *measure_field()]
+    rows = [*measure_rasteriser(), *gradient_errors(), *measure_field(), *measure_queries()]
     rows.append(["peak memory of this measurement, references included",
                  f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB", "", ""])
     text = table(["part", "ours", "reference", "ratio, remark"], rows)
