@@ -81,7 +81,8 @@ def walk_sight(stops, clear, skip, voxel_size, px, py, pz, dx, dy, dz, t_end, sh
                 return n, np.uint8(0)
             tx, ty, tz = next_border(i, px, dx), next_border(j, py, dy), next_border(k, pz, dz)
             continue
-        t_out = min(tx, min(ty, tz))
+        # Never back: from a point on a border, a ray that goes down leaves its voxel at 0, and a jump finds it again.
+        t_out = max(t, min(tx, min(ty, tz)))
         if stops[v] != 0:
             bit = blocked_cell(clear[v], px, py, pz, dx, dy, dz, t, t_out)
             if bit:

@@ -1,5 +1,6 @@
 """Kernels of sight against plain twins, on random volumes: normals, open cells, what views see and saw in vain."""
 
+import multiprocessing
 from types import SimpleNamespace
 
 import numpy as np
@@ -169,3 +170,25 @@ def test_count_looks_equals_the_reference(seed):
     # Where a ray ended once, an open voxel need not be settled by the next.
     thick = (field.kind == OPEN) & (field.stops > 0)
     assert thick.any() and not got[0][thick].any()
+
+
+def sight_along_a_border(done):
+    """Up along z, a hair to the left of a border of voxels, three voxels from the nearest of interest on the right."""
+    shape = (40, 8, 60)
+    skip = np.broadcast_to(np.abs(np.arange(40) - 27).astype(np.uint8)[:, None, None], shape).ravel()
+    stops, ids = np.zeros(skip.size, np.uint8), np.empty(sum(shape) + 3, np.int32)
+    done.put(kernels_sight.walk_sight(
+        stops, stops, skip, np.float32(0.1), *np.float32([24.0, 4.5, 2.5, -1e-7, 0, 10, 5.0]), shape, ids
+    ))
+
+
+def test_a_ray_along_a_border_comes_to_an_end():
+    """Every jump used to lead back to where it began: a kernel holds the interpreter, so it runs in its own process."""
+    spawn = multiprocessing.get_context("spawn")
+    done = spawn.Queue()
+    process = spawn.Process(target=sight_along_a_border, args=(done,))
+    process.start()
+    try:
+        assert done.get(timeout=120)[0] == 0
+    finally:
+        process.kill()
