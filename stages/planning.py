@@ -95,6 +95,6 @@ def _map(context: StageContext) -> "MapView | None":
 
 
 STAGE = Stage(
-    name="planning", version=13, config=("planning", "motion"), inputs=_inputs, run=_run, loop=True,
+    name="planning", version=14, config=("planning", "motion"), inputs=_inputs, run=_run, loop=True,
     parameters=_parameters, extra_inputs=_extra_inputs,
 )
