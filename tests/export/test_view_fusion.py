@@ -147,8 +147,8 @@ class Ball:
 
     @staticmethod
     def query_sdf(points):
-        points = np.asarray(points)
         """The ball, and a sheet at the far side that nobody read."""
+        points = np.asarray(points)
         return np.minimum(ball_sdf(points), np.abs(points[:, 0] + 0.45) - 0.02).astype(np.float32)
 
     @staticmethod
